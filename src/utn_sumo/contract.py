@@ -1,0 +1,265 @@
+"""The nouns of the bench: what flows round the loop, frozen, in numpy arrays of a stated shape.
+
+    plant -> Measurement -> State -> Forecast -> Plan -> (checked) -> plant
+
+Counts are in veh, times in s, lengths in m, rates in veh/s unless a name says otherwise. Index
+spaces: Z links, M turns (one per link and next link or exit), S stages, J junctions, Kp and Kc horizons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+EXIT = -1
+
+
+@dataclass(frozen=True)
+class Link:
+    """A road that leads to a signalled junction: the unit of state of the macroscopic model."""
+
+    id: str
+    edges: tuple[str, ...]
+    """SUMO edges from its entry to its stop line."""
+    junction: int
+    lanes: int
+    length_m: float
+    free_speed_m_s: float
+    storage_veh: float
+    saturation_flow_veh_s: float
+    """Of all its lanes together (mu_z)."""
+    is_source: bool
+    """Whether traffic from outside enters here."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A sub-stream of a link: the traffic that goes on to one next link, or leaves the network."""
+
+    link: int
+    to_edge: str
+    next_link: int
+    """Index of the link fed, or EXIT."""
+    fraction: float
+    """beta_{z,d}: share of the link's traffic that takes this turn."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A set of signals that are green together, and the clearance that follows it."""
+
+    junction: int
+    state: str
+    """SUMO signal letters while green."""
+    clearance: tuple[tuple[str, float], ...]
+    """(letters, seconds) shown in turn after it: yellow, all-red."""
+    turns: tuple[int, ...]
+    """Turns that it serves."""
+
+    @property
+    def clearance_s(self) -> float:
+        return sum(duration for _, duration in self.clearance)
+
+
+@dataclass(frozen=True)
+class Junction:
+    """A signalled junction: its stages in the order of its cycle, and which signals conflict."""
+
+    id: str
+    stages: tuple[int, ...]
+    cycle_s: float
+    offset_s: float
+    min_green_s: float
+    signal_turn: tuple[int, ...]
+    """Turn of each signal letter, -1 where the letter serves none that we model."""
+    conflicts: tuple[tuple[bool, ...], ...]
+    """conflicts[a][b]: the streams of letters a and b cross."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """Links, turns, stages and junctions, as read from a SUMO net (SPEC 1)."""
+
+    name: str
+    net_file: Path
+    links: tuple[Link, ...]
+    turns: tuple[Turn, ...]
+    stages: tuple[Stage, ...]
+    junctions: tuple[Junction, ...]
+    edge_lanes: Mapping[str, int]
+    """Lanes of every SUMO edge that a link or a turn names."""
+    edge_length_m: Mapping[str, float]
+
+    @cached_property
+    def turn_link(self) -> Ints:
+        """(M,) link of each turn."""
+        return np.array([turn.link for turn in self.turns], dtype=np.int64)
+
+    @cached_property
+    def turn_next(self) -> Ints:
+        """(M,) link that each turn feeds, or EXIT."""
+        return np.array([turn.next_link for turn in self.turns], dtype=np.int64)
+
+    @cached_property
+    def fraction(self) -> Floats:
+        """(M,) turning fractions beta; they sum to 1 over a link."""
+        return np.array([turn.fraction for turn in self.turns])
+
+    @cached_property
+    def serves(self) -> Bools:
+        """(S, M) whether a stage gives green to a turn."""
+        matrix = np.zeros((len(self.stages), len(self.turns)), dtype=np.bool_)
+        for index, stage in enumerate(self.stages):
+            matrix[index, list(stage.turns)] = True
+        return matrix
+
+    @cached_property
+    def link_junction(self) -> Ints:
+        """(Z,) junction that each link enters."""
+        return np.array([link.junction for link in self.links], dtype=np.int64)
+
+    @cached_property
+    def stage_junction(self) -> Ints:
+        """(S,) junction of each stage."""
+        return np.array([stage.junction for stage in self.stages], dtype=np.int64)
+
+    @cached_property
+    def storage_veh(self) -> Floats:
+        """(Z,) vehicles that fit on each link (C_z)."""
+        return np.array([link.storage_veh for link in self.links])
+
+    @cached_property
+    def saturation_flow_veh_s(self) -> Floats:
+        """(Z,) saturation flow mu_z of each link."""
+        return np.array([link.saturation_flow_veh_s for link in self.links])
+
+    @cached_property
+    def is_source(self) -> Bools:
+        """(Z,) whether traffic from outside enters the link."""
+        return np.array([link.is_source for link in self.links], dtype=np.bool_)
+
+    @cached_property
+    def free_time_s(self) -> Floats:
+        """(Z,) free-flow travel time of each link."""
+        return np.array([link.length_m / link.free_speed_m_s for link in self.links])
+
+    @cached_property
+    def min_green_s(self) -> Floats:
+        """(S,) shortest green of each stage."""
+        return np.array([self.junctions[stage.junction].min_green_s for stage in self.stages])
+
+    @cached_property
+    def cycle_s(self) -> Floats:
+        """(J,) cycle of each junction."""
+        return np.array([junction.cycle_s for junction in self.junctions])
+
+    @cached_property
+    def green_budget_s(self) -> Floats:
+        """(J,) green that a cycle can give away: the cycle less the lost time L_j (SPEC 3)."""
+        return np.array(
+            [
+                junction.cycle_s - sum(self.stages[s].clearance_s for s in junction.stages)
+                for junction in self.junctions
+            ]
+        )
+
+    @property
+    def control_step_s(self) -> float:
+        """Time between two decisions: the least common multiple of the cycles (SPEC 2.7, N = 1)."""
+        return float(np.lcm.reduce(self.cycle_s.astype(np.int64)))
+
+    def link_index(self, link_id: str) -> int:
+        """Index of the link called `link_id`."""
+        return next(index for index, link in enumerate(self.links) if link.id == link_id)
+
+    def equal_split(self) -> Plan:
+        """The backup plan: each junction's green shared equally among its stages, in whole seconds."""
+        green = np.zeros(len(self.stages))
+        for junction, budget in zip(self.junctions, self.green_budget_s, strict=True):
+            share, rest = divmod(round(budget), len(junction.stages))
+            for position, stage in enumerate(junction.stages):
+                green[stage] = share + (position < rest)
+        return Plan(green_s=green)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What the detectors counted over one control step, and lane-area readings at its end."""
+
+    time_s: float
+    """End of the step."""
+    entered_veh: Floats
+    """(Z,) over the loops at the link's entry."""
+    left_veh: Floats
+    """(Z,) over the loops at its stop line."""
+    to_edge_veh: Floats
+    """(M,) over the entry loops of the edge that the turn leads to, whoever fed it."""
+    queue_veh: Floats
+    """(Z,) standing in the lane-area detectors at the end."""
+    seen_veh: Floats
+    """(Z,) in the lane-area detectors at the end, moving or not."""
+    entry_occupancy: Floats
+    """(Z,) share of the step in which the entry loops were covered, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class State:
+    """The estimate that a controller works from: no SUMO object in it."""
+
+    cycle: int
+    time_s: float
+    x_veh: Floats
+    """(Z,) vehicles on each link."""
+    q_veh: Floats
+    """(M,) queued vehicles by turn; their sum over a link is at most its x."""
+    source_queue_veh: Floats
+    """(Z,) vehicles that wait outside a source link for room to enter."""
+    inflow_veh: Floats
+    """(Z,) vehicles that entered in the last step (f_in(k-1) c)."""
+    turned_veh: Floats
+    """(M,) vehicles that made each turn in the last step; their sum over a link is what left it."""
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What is expected from outside over the horizon."""
+
+    demand_veh: Floats
+    """(Kp, Z) vehicles that will want to enter each source link in each step ahead."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Greens for every stage, for the coming cycle and, where the controller has them, for later ones."""
+
+    green_s: Floats
+    """(S,)"""
+    ahead_s: Floats | None = None
+    """(n, S) greens of the n cycles after that: what a failing controller is followed by."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """What the controller wants recorded: iterations, residuals, cost."""
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """Whatever chooses greens once a control step.
+
+    A controller is built as `Class(network, **settings)`.
+    """
+
+    horizon: int
+    """Steps of forecast that it wants (Kp); 1 where it wants none."""
+
+    def plan(self, state: State, forecast: Forecast) -> Plan:
+        """Greens for the coming step. May raise: the supervisor then falls back and records it."""
+        ...

@@ -1,0 +1,236 @@
+"""A SUMO net read into links, turns, stages and junctions: the one door to sumolib.
+
+A link is the road that leads to a signalled junction, chained upstream through nodes that neither
+split nor join traffic. Stages are the programme's phases that show green; what follows each of them is
+its clearance, taken from the net and never optimised. Conflicts come from the net's own right-of-way matrix.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import utn_network
+from utn_sumo.contract import EXIT, Junction, Link, Network, Stage, Turn
+from utn_sumo.errors import NetworkError, did_you_mean
+
+SPACE_PER_VEHICLE_M = 7.5
+"""A standing vehicle and its gap: SUMO's default 5 m + 2.5 m (SPEC 1: 2 * 400 / 7.5 = 106)."""
+SATURATION_FLOW_VEH_S_LANE = 0.52
+"""Discharge of a lane after start-up, measured on `utn17`: tools/bench.py saturation prints it."""
+MIN_GREEN_S = 10.0
+
+
+def load(name: str) -> Network:
+    """The shipped network `name`, or the one in the .net.xml file that `name` is a path of.
+
+    Turning fractions are read from NAME.turns.xml beside the net (SUMO's edgeRelations); without the file every
+    lane-to-lane connection of a link is taken to carry the same share.
+    """
+    if name in utn_network.names():
+        return read(utn_network.net_file(name), name)
+    path = Path(name)
+    if not path.is_file():
+        known = did_you_mean(name, utn_network.names())
+        raise NetworkError(f"net {name!r}: neither a shipped net nor a file; {known}")
+    return read(path, path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net"))
+
+
+def read(path: Path, name: str) -> Network:
+    """Read one net file. Raises NetworkError with one line if it can't be used."""
+    import sumolib  # noqa: PLC0415 - heavy, and only this door needs it
+
+    try:
+        net = sumolib.net.readNet(
+            str(path), withPrograms=True, withLatestPrograms=True, withFoes=True, withInternal=False
+        )
+    except Exception as error:  # noqa: BLE001 - whatever a foreign file makes sumolib raise
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise NetworkError(
+            f"net {str(path)!r} can't be read ({reason}): give a .net.xml written by netconvert"
+        ) from error
+    signals = sorted(net.getTrafficLights(), key=lambda tls: _natural(tls.getID()))
+    if not signals:
+        raise NetworkError(f"net {str(path)!r} has no traffic lights: there is nothing to control")
+    return _Reader(net, signals, _read_fractions(path)).network(path.resolve(), name)
+
+
+class _Reader:
+    """Builds the index spaces in the order links, turns, stages, junctions."""
+
+    def __init__(self, net: Any, signals: list[Any], fractions: dict[tuple[str, str], float]):
+        self.net = net
+        self.signals = signals
+        self.fractions = fractions
+        # Approach edge -> position of the junction that it enters.
+        self.junction_of = {
+            connection[0].getEdge().getID(): position
+            for position, tls in enumerate(signals)
+            for connection in tls.getConnections()
+        }
+        self.approaches = sorted(self.junction_of, key=_natural)
+        self.chains = {edge: self._chain(edge) for edge in self.approaches}
+        self.link_of_edge = {
+            member: index for index, edge in enumerate(self.approaches) for member in self.chains[edge]
+        }
+
+    def network(self, path: Path, name: str) -> Network:
+        turns = self._turns()
+        fed = {turn.next_link for turn in turns}
+        links = tuple(self._link(edge, index in fed) for index, edge in enumerate(self.approaches))
+        turn_index = {(turn.link, turn.to_edge): index for index, turn in enumerate(turns)}
+        stages: list[Stage] = []
+        junctions: list[Junction] = []
+        for position, tls in enumerate(self.signals):
+            signal_turn = self._signal_turns(tls, turn_index)
+            program = next(iter(tls.getPrograms().values()), None)
+            if program is None:
+                raise NetworkError(f"junction {tls.getID()!r} has no signal programme: add a tlLogic for it")
+            first = len(stages)
+            stages += _stages(tls.getID(), program, position, signal_turn)
+            junctions.append(
+                Junction(
+                    id=tls.getID(),
+                    stages=tuple(range(first, len(stages))),
+                    cycle_s=sum(phase.duration for phase in program.getPhases()),
+                    offset_s=float(program.getOffset()),
+                    min_green_s=MIN_GREEN_S,
+                    signal_turn=tuple(signal_turn),
+                    conflicts=self._conflicts(tls, len(signal_turn)),
+                )
+            )
+        edges = {edge for link in links for edge in link.edges} | {turn.to_edge for turn in turns}
+        return Network(
+            name,
+            path,
+            links,
+            tuple(turns),
+            tuple(stages),
+            tuple(junctions),
+            edge_lanes={edge: self.net.getEdge(edge).getLaneNumber() for edge in sorted(edges)},
+            edge_length_m={edge: self.net.getEdge(edge).getLength() for edge in sorted(edges)},
+        )
+
+    def _chain(self, approach: str) -> tuple[str, ...]:
+        """The approach and the edges upstream of it as long as one edge leads only to the next."""
+        chain = [approach]
+        while True:
+            incoming = list(self.net.getEdge(chain[0]).getIncoming())
+            if len(incoming) != 1 or incoming[0].getID() in self.junction_of:
+                return tuple(chain)
+            before = incoming[0]
+            if len(before.getOutgoing()) != 1 or before.getID() in chain:
+                return tuple(chain)
+            chain.insert(0, before.getID())
+
+    def _link(self, edge_id: str, fed: bool) -> Link:
+        edges = [self.net.getEdge(member) for member in self.chains[edge_id]]
+        last = edges[-1]
+        lane_m = sum(edge.getLength() * edge.getLaneNumber() for edge in edges)
+        length = sum(edge.getLength() for edge in edges)
+        return Link(
+            id=edge_id,
+            edges=self.chains[edge_id],
+            junction=self.junction_of[edge_id],
+            lanes=last.getLaneNumber(),
+            length_m=length,
+            free_speed_m_s=length / sum(edge.getLength() / edge.getSpeed() for edge in edges),
+            storage_veh=lane_m / SPACE_PER_VEHICLE_M,
+            saturation_flow_veh_s=last.getLaneNumber() * SATURATION_FLOW_VEH_S_LANE,
+            is_source=not fed,
+        )
+
+    def _turns(self) -> list[Turn]:
+        turns = []
+        for index, edge_id in enumerate(self.approaches):
+            outgoing = self.net.getEdge(edge_id).getOutgoing()
+            targets = sorted(outgoing, key=lambda edge: _natural(edge.getID()))
+            lanes = [len(outgoing[edge]) for edge in targets]
+            given = [self.fractions.get((edge_id, edge.getID())) for edge in targets]
+            if any(value is not None for value in given):
+                weights = [value or 0.0 for value in given]
+            else:
+                weights = [float(count) for count in lanes]
+            total = sum(weights)
+            if total <= 0:
+                raise NetworkError(f"link {edge_id!r}: its turning fractions sum to {total}: give it some")
+            turns += [
+                Turn(index, edge.getID(), self._fed_link(edge.getID()), weight / total)
+                for edge, weight in zip(targets, weights, strict=True)
+            ]
+        return turns
+
+    def _fed_link(self, edge_id: str) -> int:
+        """The link that traffic on `edge_id` reaches with no choice left to it, or EXIT."""
+        visited = set()
+        while edge_id not in self.link_of_edge:
+            outgoing = list(self.net.getEdge(edge_id).getOutgoing())
+            if len(outgoing) != 1 or edge_id in visited:
+                return EXIT
+            visited.add(edge_id)
+            edge_id = outgoing[0].getID()
+        return self.link_of_edge[edge_id]
+
+    def _signal_turns(self, tls: Any, turn_index: dict[tuple[int, str], int]) -> list[int]:
+        size = 1 + max(index for _, _, index in tls.getConnections())
+        result = [-1] * size
+        for from_lane, to_lane, index in tls.getConnections():
+            link = self.approaches.index(from_lane.getEdge().getID())
+            result[index] = turn_index[link, to_lane.getEdge().getID()]
+        return result
+
+    def _conflicts(self, tls: Any, size: int) -> tuple[tuple[bool, ...], ...]:
+        matrix = [[False] * size for _ in range(size)]
+        streams = []
+        for from_lane, to_lane, index in tls.getConnections():
+            node = from_lane.getEdge().getToNode()
+            connection = next(c for c in from_lane.getOutgoing() if c.getToLane() == to_lane)
+            streams.append((node, node.getLinkIndex(connection), index))
+        for node_a, request_a, a in streams:
+            for node_b, request_b, b in streams:
+                if node_a == node_b and a != b and node_a.areFoes(request_a, request_b):
+                    matrix[a][b] = matrix[b][a] = True
+        return tuple(tuple(row) for row in matrix)
+
+
+def _stages(tls_id: str, program: Any, junction: int, signal_turn: list[int]) -> list[Stage]:
+    """Cut a programme into stages, each a green phase with the phases up to the next green one."""
+    phases = program.getPhases()
+    starts = [i for i, phase in enumerate(phases) if _is_green(phase.state)]
+    if len(starts) < 2 or starts[0] != 0:
+        raise NetworkError(
+            f"junction {tls_id!r}: its programme must open with a green phase and have two or more of them"
+        )
+    stages = []
+    for start, end in pairwise([*starts, len(phases)]):
+        green = phases[start].state
+        served = {signal_turn[i] for i, letter in enumerate(green) if letter in "Gg" and signal_turn[i] >= 0}
+        clearance = tuple((phase.state, float(phase.duration)) for phase in phases[start + 1 : end])
+        stages.append(Stage(junction, green, clearance, tuple(sorted(served))))
+    return stages
+
+
+def _is_green(state: str) -> bool:
+    return any(letter in "Gg" for letter in state) and not any(letter in "yYu" for letter in state)
+
+
+def _read_fractions(net_path: Path) -> dict[tuple[str, str], float]:
+    """Turning fractions by (from edge, to edge) from the file beside the net, empty without one."""
+    from defusedxml import ElementTree  # noqa: PLC0415
+    from defusedxml.common import DefusedXmlException  # noqa: PLC0415
+
+    stem = net_path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net")
+    path = net_path.with_name(f"{stem}.turns.xml")
+    if not path.is_file():
+        return {}
+    try:
+        relations = ElementTree.parse(path).iter("edgeRelation")
+        return {(r.get("from"), r.get("to")): float(r.get("probability")) for r in relations}
+    except (ElementTree.ParseError, DefusedXmlException, TypeError, ValueError) as error:
+        raise NetworkError(f"turning fractions {str(path)!r} can't be read ({error})") from error
+
+
+def _natural(text: str) -> tuple[int, int, str]:
+    """Sort key that puts '2' before '10' and numbers before names."""
+    return (0, int(text), "") if text.isdecimal() else (1, 0, text)
