@@ -9,7 +9,7 @@ spaces: Z links, M turns (one per link and next link or exit), S stages, J junct
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -173,10 +173,56 @@ class Network:
             ]
         )
 
+    @cached_property
+    def delay_steps(self) -> int:
+        """Control steps that the longest free-flow delay reaches back to: the H of State.past_inflow_veh."""
+        return 1 + int(np.ceil(self.free_time_s.max() / self.control_step_s))
+
     @property
     def control_step_s(self) -> float:
         """Time between two decisions: the least common multiple of the cycles (SPEC 2.7, N = 1)."""
         return float(np.lcm.reduce(self.cycle_s.astype(np.int64)))
+
+    def part(self, junction: int) -> Network:
+        """The network of one junction alone: its incoming links, their turns, its stages.
+
+        Indices count within the part; a turn that leads to another junction ends in EXIT.
+        """
+        links = [index for index, link in enumerate(self.links) if link.junction == junction]
+        turns = [index for index, turn in enumerate(self.turns) if turn.link in links]
+        place = {link: position for position, link in enumerate(links)}
+        turn_place = {turn: position for position, turn in enumerate(turns)}
+        whole = self.junctions[junction]
+        return Network(
+            name=f"{self.name}:{whole.id}",
+            net_file=self.net_file,
+            links=tuple(replace(self.links[link], junction=0) for link in links),
+            turns=tuple(
+                replace(
+                    self.turns[turn],
+                    link=place[self.turns[turn].link],
+                    next_link=place.get(self.turns[turn].next_link, EXIT),
+                )
+                for turn in turns
+            ),
+            stages=tuple(
+                replace(
+                    self.stages[stage],
+                    junction=0,
+                    turns=tuple(turn_place[turn] for turn in self.stages[stage].turns),
+                )
+                for stage in whole.stages
+            ),
+            junctions=(
+                replace(
+                    whole,
+                    stages=tuple(range(len(whole.stages))),
+                    signal_turn=tuple(turn_place.get(turn, -1) for turn in whole.signal_turn),
+                ),
+            ),
+            edge_lanes=self.edge_lanes,
+            edge_length_m=self.edge_length_m,
+        )
 
     def link_index(self, link_id: str) -> int:
         """Index of the link called `link_id`."""
@@ -224,8 +270,8 @@ class State:
     """(M,) queued vehicles by turn; their sum over a link is at most its x."""
     source_queue_veh: Floats
     """(Z,) vehicles that wait outside a source link for room to enter."""
-    inflow_veh: Floats
-    """(Z,) vehicles that entered in the last step (f_in(k-1) c)."""
+    past_inflow_veh: Floats
+    """(H, Z) vehicles that entered in each of the last steps, newest first (f_in(k-1) c, ...)."""
     turned_veh: Floats
     """(M,) vehicles that made each turn in the last step; their sum over a link is what left it."""
 

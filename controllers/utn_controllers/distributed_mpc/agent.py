@@ -1,0 +1,77 @@
+"""One agent: the local problem, its solver, and the copies that it coordinates with its neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from utn_controllers.distributed_mpc.problem import JunctionProblem, QuadraticProgram
+from utn_sumo.contract import Floats, Forecast, State
+from utn_sumo.errors import ControllerError
+
+EQUALITY = 5
+"""DAQP's code for an equality row."""
+OPTIMAL = (1, 2)
+"""DAQP's exit flags of an optimum: 1, and 2 with a soft constraint in use."""
+
+
+class Agent:
+    """Solves  min phi + sum over produced [lam (w - zb) + rho/2 (w - zb)^2] + sum over consumed [...]  (SPEC 4)."""
+
+    def __init__(self, problem: JunctionProblem, place: dict[int, int]):
+        """`place` gives each interaction (a link that has a producer and a consumer) its row."""
+        self.problem = problem
+        horizon = problem.settings.horizon
+        consumed, produced = problem.consumed(), problem.produced()
+        self.interactions = np.array([place[link] for link in consumed + produced], dtype=np.int64)
+        """(n,) rows of the interactions, consumed ones first."""
+        self.sign = np.array([-1.0] * len(consumed) + [1.0] * len(produced))
+        """(n,) sign of the multiplier in the agent's cost: +1 as producer, -1 as consumer."""
+        blocks = [problem.inflow_rows(link) for link in consumed] + [problem.outflow_rows(link) for link in produced]
+        self._coupling = np.vstack(blocks) if blocks else np.zeros((0, problem.layout.size))
+        self._gram = self._coupling.T @ self._coupling
+        self._shape = (len(self.interactions), horizon)
+        self.program: QuadraticProgram | None = None
+        self.solution: Floats = np.zeros(problem.layout.size)
+        self._solver: object = None
+        self._rho = 0.0
+
+    def prepare(self, state: State, forecast: Forecast, rho: float) -> None:
+        """Take up a new state: the local programme, factorised for this `rho`."""
+        self.program = self.problem.program(state, forecast)
+        self.factorise(rho)
+
+    def factorise(self, rho: float) -> None:
+        """Set the solver up for another `rho`."""
+        import daqp  # noqa: PLC0415 - compiled, loaded at use
+
+        program = self.program
+        assert program is not None
+        sense = np.zeros(len(program.upper), dtype=np.int32)
+        sense[program.lower == program.upper] = EQUALITY
+        self._rho = rho
+        self._solver = daqp.Model()
+        flag, _ = self._solver.setup(
+            program.hessian + rho * self._gram,
+            program.gradient,
+            program.matrix,
+            np.minimum(program.upper, 1e30),
+            np.maximum(program.lower, -1e30),
+            sense,
+        )
+        if flag < 0:
+            raise ControllerError(f"agent {self.problem.part.name}: the solver refused its problem (flag {flag})")
+
+    def solve(self, mean: Floats, price: Floats) -> Floats:
+        """Best answer to the interactions' means and prices; (n, Kp) copies of their flows [veh].
+
+        `mean` and `price` (n, Kp) are zb and lam of this agent's interactions.
+        """
+        program = self.program
+        assert program is not None
+        linear = (self.sign[:, None] * price - self._rho * mean).ravel()
+        self._solver.update(f=program.gradient + self._coupling.T @ linear)
+        solution, _, flag, _ = self._solver.solve()
+        if flag not in OPTIMAL or not np.isfinite(solution).all():
+            raise ControllerError(f"agent {self.problem.part.name}: no optimum (flag {flag})")
+        self.solution = solution
+        return (self._coupling @ solution).reshape(self._shape)

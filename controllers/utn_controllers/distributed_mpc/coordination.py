@@ -1,0 +1,88 @@
+"""ADMM among the agents (SPEC 4): consensus on the flow between every producer and its consumer.
+
+Boyd et al. 2011, sections 3.4.1 (varying penalty), 3.4.3 (over-relaxation) and 3.3.1 (stopping).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from utn_controllers.distributed_mpc.settings import Settings
+from utn_sumo.contract import Floats
+
+if TYPE_CHECKING:
+    from utn_controllers.distributed_mpc.agent import Agent
+
+ADAPT_RATIO = 10.0
+ADAPT_FACTOR = 2.0
+ADAPT_ITERATIONS = 5
+"""The penalty adapts in the first iterations of the first steps, then it is frozen."""
+BYTES_PER_NUMBER = 8
+
+
+@dataclass
+class Consensus:
+    """What the agents agree on, kept warm from one control step to the next."""
+
+    mean: Floats
+    """(interactions, Kp) zb [veh]."""
+    price: Floats
+    """(interactions, Kp) lam."""
+    rho: float
+
+    def shift(self) -> None:
+        """One control step on: everything moves up by a step, and the last one is repeated."""
+        for array in (self.mean, self.price):
+            array[:, :-1] = array[:, 1:]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a coordination ended."""
+
+    iterations: int
+    primal_veh: float
+    dual: float
+    converged: bool
+    bytes_exchanged: int
+
+
+def admm(agents: list[Agent], consensus: Consensus, settings: Settings) -> Outcome:
+    """Iterate until both residuals are under tolerance or the cap is reached; changes `consensus`.
+
+    Raises ControllerError if an agent has no optimum.
+    """
+    shape = consensus.mean.shape
+    numbers = consensus.mean.size
+    primal = dual = np.inf
+    converged = False
+    iteration = 0
+    for iteration in range(1, settings.iterations + 1):  # noqa: B007 - used after the loop
+        flow = {1.0: np.zeros(shape), -1.0: np.zeros(shape)}
+        for agent in agents:
+            rows = agent.interactions
+            copies = agent.solve(consensus.mean[rows], consensus.price[rows])
+            for row, sign, copy in zip(rows, agent.sign, copies, strict=True):
+                flow[float(sign)][row] = copy
+        produced, consumed = (
+            settings.relaxation * flow[sign] + (1 - settings.relaxation) * consensus.mean for sign in (1.0, -1.0)
+        )
+        before = consensus.mean
+        consensus.mean = (produced + consumed) / 2
+        consensus.price = consensus.price + consensus.rho * (produced - consensus.mean)
+
+        primal = float(np.sqrt(sum(np.sum((copy - consensus.mean) ** 2) for copy in flow.values())))
+        dual = float(consensus.rho * np.sqrt(2 * np.sum((consensus.mean - before) ** 2)))
+        scale = np.sqrt(2 * numbers) * settings.tolerance_abs
+        sizes = max(np.sqrt(sum(np.sum(copy**2) for copy in flow.values())), np.sqrt(2 * np.sum(consensus.mean**2)))
+        prices = np.sqrt(2 * np.sum(consensus.price**2))
+        converged = bool(
+            primal <= scale + settings.tolerance_rel * sizes
+            and dual <= scale * consensus.rho + settings.tolerance_rel * prices
+        )
+        if converged:
+            break
+    return Outcome(iteration, primal, dual, converged, 2 * iteration * numbers * BYTES_PER_NUMBER)

@@ -1,0 +1,51 @@
+"""Settings of the distributed MPC, with the paper's values as defaults where the paper has them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from utn_sumo.contract import Network
+
+
+class Settings(BaseModel):
+    """What a user may set; every field is checked when the controller is built."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    horizon: int = Field(7, ge=1, le=60)
+    """Kp, control steps predicted."""
+    control_horizon: int = Field(4, ge=1, le=60)
+    """Kc, control steps in which the greens may change; held after it."""
+    cost: Literal["tts", "paper"] = "tts"
+    q: float = Field(0.1, ge=0)
+    """Q of the paper's cost: weight of x^2."""
+    r: float = Field(0.3, ge=0)
+    """R of the paper's cost: weight of g^2 (g in s)."""
+    crowding: float = Field(1.0, ge=0)
+    """Weight of x^2 / storage beside the time spent in the `tts` cost: what keeps room on the links."""
+    iterations: int = Field(10, ge=1, le=1000)
+    """Most ADMM iterations in a control step."""
+    rho: float = Field(0.1, gt=0)
+    """First ADMM penalty."""
+    relaxation: float = Field(1.6, gt=0, lt=2)
+    tolerance_abs: float = Field(1e-2, gt=0)
+    """Absolute tolerance of the residuals [veh]."""
+    tolerance_rel: float = Field(1e-3, ge=0)
+
+    def stage_cost(self, x: Any, waiting: Any, part: Network) -> Any:
+        """Cost of one predicted step, in CasADi symbols: x and the source queues of a junction's links."""
+        import casadi as ca  # noqa: PLC0415 - heavy
+
+        if self.cost == "paper":
+            return self.q * (ca.sumsqr(x) + ca.sumsqr(waiting))
+        return ca.sum1(x) + ca.sum1(waiting) + self.crowding * ca.sum1(x**2 / part.storage_veh)
+
+    def green_cost(self, green: Any) -> Any:
+        """Cost of one step's greens."""
+        import casadi as ca  # noqa: PLC0415 - heavy
+
+        if self.cost == "paper":
+            return self.r * ca.sumsqr(green)
+        return 1e-4 * ca.sumsqr(green)

@@ -1,0 +1,150 @@
+"""Demand of SPEC 7: profiles to individual trips, drawn once per seed and cached as a SUMO route file.
+
+Arrivals at each source are a Poisson process whose rate is constant within a control step; each vehicle's
+route is drawn from the turning fractions. Every source has a random stream of its own, so that
+adding a source does not change the others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import numpy.typing as npt
+
+from utn_sumo.contract import EXIT, Floats, Network
+
+LOW_VEH_H, HIGH_VEH_H = 300.0, 800.0
+PAPER_MEAN_VEH_H, PAPER_SD_VEH_H = 550.0, 125.0
+PROFILES = ("peak", "paper", "constant")
+NOISE_PERSISTENCE = 0.7
+"""Lag-one correlation of the optional noise, over control steps."""
+NOISE_SHARED = 0.5
+"""Share of its variance that all sources have in common."""
+FORMAT = 3
+"""Counted up when the same settings give other trips, so that stale caches are left aside."""
+
+
+def mean_profile_veh_h(network: Network, profile: str, steps: int, scale: float) -> Floats:
+    """(steps, Z) mean demand by link: what is known in advance, without noise and without the draw."""
+    middle = (np.arange(steps) + 0.5) / steps
+    shape = {
+        # A bell from 300 to 800 and back: three standard deviations to either side of the middle.
+        "peak": LOW_VEH_H + (HIGH_VEH_H - LOW_VEH_H) * np.exp(-18 * (middle - 0.5) ** 2),
+        "paper": np.full(steps, PAPER_MEAN_VEH_H),
+        "constant": np.full(steps, HIGH_VEH_H),
+    }[profile]
+    return scale * shape[:, None] * network.is_source[None, :]
+
+
+def drawn_rates_veh_h(
+    network: Network, profile: str, steps: int, scale: float, noise: float, seed: int
+) -> Floats:
+    """(steps, Z) the demand rates of one seed: the mean profile, the paper's draw each step, the noise.
+
+    `noise` is the standard deviation of a multiplicative disturbance correlated in time and among sources.
+    """
+    rng = np.random.default_rng([seed, 0xDE])
+    rates = mean_profile_veh_h(network, profile, steps, scale)
+    sources = np.flatnonzero(network.is_source)
+    if profile == "paper":
+        for step in range(steps):
+            for link in sources:
+                rates[step, link] = scale * _truncated_normal(rng)
+    if noise > 0:
+        level = np.zeros(len(sources))
+        for step in range(steps):
+            shock = np.sqrt(NOISE_SHARED) * rng.standard_normal()
+            shock = shock + np.sqrt(1 - NOISE_SHARED) * rng.standard_normal(len(sources))
+            fresh = shock if step == 0 else np.sqrt(1 - NOISE_PERSISTENCE**2) * shock
+            level = NOISE_PERSISTENCE * level + fresh if step else fresh
+            rates[step, sources] *= np.maximum(0.0, 1 + noise * level)
+    return rates
+
+
+def route_file(
+    network: Network,
+    *,
+    profile: str,
+    duration_s: float,
+    step_s: float,
+    scale: float,
+    noise: float,
+    seed: int,
+    cache: Path | None = None,
+) -> Path:
+    """The route file of these settings, drawn if the cache does not hold it.
+
+    The cache is `$UTN_CACHE`, else `~/.cache/utn-sumo`. A file is written aside and moved into place, so that
+    runs side by side never see half of one.
+    """
+    key = repr((FORMAT, profile, duration_s, step_s, scale, noise, seed, network.turns, network.links))
+    digest = hashlib.sha256(key.encode()).hexdigest()[:16]
+    folder = cache or Path(os.environ.get("UTN_CACHE", Path.home() / ".cache" / "utn-sumo"))
+    path = folder / f"{network.name}-{profile}-{scale:g}-seed{seed}-{digest}.rou.xml"
+    if path.is_file():
+        return path
+    steps = int(np.ceil(duration_s / step_s))
+    rates = drawn_rates_veh_h(network, profile, steps, scale, noise, seed)
+    trips = _trips(network, rates, step_s, duration_s, seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".part", delete=False, encoding="utf-8") as part:
+        part.write("<routes>\n")
+        for number, (depart_s, edges) in enumerate(trips):
+            part.write(
+                f'  <vehicle id="v{number}" depart="{depart_s:.2f}" departLane="best" departSpeed="max">'
+                f"<route edges={quoteattr(' '.join(edges))}/></vehicle>\n"
+            )
+        part.write("</routes>\n")
+    Path(part.name).replace(path)
+    return path
+
+
+def _trips(
+    network: Network, rates_veh_h: Floats, step_s: float, duration_s: float, seed: int
+) -> list[tuple[float, list[str]]]:
+    """(departure time, edges) of every vehicle, in order of departure."""
+    trips: list[tuple[float, int, list[str]]] = []
+    turns_of = [np.flatnonzero(network.turn_link == link) for link in range(len(network.links))]
+    cumulative = [np.cumsum(network.fraction[turns]) for turns in turns_of]
+    for source in np.flatnonzero(network.is_source):
+        rng = np.random.default_rng([seed, 0xA7, int(source)])
+        counts = rng.poisson(rates_veh_h[:, source] * step_s / 3600)
+        departures = np.concatenate(
+            [step * step_s + np.sort(rng.uniform(0, step_s, n)) for step, n in enumerate(counts)]
+        )
+        for depart_s in departures[departures < duration_s]:
+            trips.append((float(depart_s), int(source), _route(network, int(source), turns_of, cumulative, rng)))
+    trips.sort(key=lambda trip: trip[:2])
+    return [(depart_s, edges) for depart_s, _, edges in trips]
+
+
+def _route(
+    network: Network,
+    source: int,
+    turns_of: list[npt.NDArray[np.int64]],
+    cumulative: list[Floats],
+    rng: np.random.Generator,
+) -> list[str]:
+    """Edges of one vehicle from its source, turn by turn, until it leaves the network."""
+    edges = list(network.links[source].edges)
+    link = source
+    while True:
+        position = np.searchsorted(cumulative[link], rng.uniform(), side="right")
+        turn = network.turns[turns_of[link][min(position, len(turns_of[link]) - 1)]]
+        if turn.next_link == EXIT:
+            return [*edges, turn.to_edge]
+        link = turn.next_link
+        edges += network.links[link].edges
+
+
+def _truncated_normal(rng: np.random.Generator) -> float:
+    """A draw of the paper's demand [veh/h]: normal, redrawn until it falls between 300 and 800."""
+    while True:
+        value = rng.normal(PAPER_MEAN_VEH_H, PAPER_SD_VEH_H)
+        if LOW_VEH_H <= value <= HIGH_VEH_H:
+            return float(value)

@@ -1,0 +1,201 @@
+"""SUMO as the plant: the one door to libsumo.
+
+How a plan is handed over (FINDINGS 2, and tests/integration/test_plant.py): at the second in which a junction's
+cycle begins, `setProgramLogic` replaces its programme and `setPhaseDuration` gives the green that
+has just begun its new length, so that the plan acts from that very second. Between two
+junctions' boundaries the simulation jumps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from utn_sumo import detectors
+from utn_sumo.contract import Floats, Measurement, Network, Plan
+from utn_sumo.errors import PlantError
+
+SAMPLE_S = 10.0
+"""Rhythm in which the true state is sampled for the record (the paper's sampling interval)."""
+PROGRAM = "utn"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What SUMO itself knows over one control step: for the record and for tests, never for a controller."""
+
+    x_veh: Floats
+    """(Z,) vehicles on each link at the end of the step."""
+    waiting_veh: Floats
+    """(Z,) vehicles that wait to be inserted on each link at its end."""
+    max_x_veh: Floats
+    """(Z,) largest sampled number of vehicles on each link."""
+    max_queue_veh: Floats
+    """(Z,) largest sampled number of halting vehicles on each link."""
+    in_network_veh: int
+    """Vehicles on any road at the end of the step."""
+
+
+class SumoPlant:
+    """One SUMO run behind libsumo. Use as a context manager; only one may be open in a process."""
+
+    _owner: SumoPlant | None = None
+
+    def __init__(self, network: Network, routes: Path, folder: Path, *, seed: int, duration_s: float):
+        """`folder` takes SUMO's own outputs: trips.xml, signals.xml (every switch), sumo.log."""
+        self.network = network
+        self.routes = routes
+        self.folder = folder
+        self.seed = seed
+        self.duration_s = duration_s
+        self.time_s = 0.0
+        self.truth: Truth | None = None
+        self._ids = detectors.ids(network)
+        self._boundary_s = [junction.offset_s for junction in network.junctions]
+        self._sumo: Any = None
+
+    def __enter__(self) -> Self:
+        if SumoPlant._owner is not None:
+            # libsumo would silently replace the first simulation by the second (FINDINGS 6).
+            raise PlantError("SUMO already runs in this process: close that plant first, or use another process")
+        import libsumo  # noqa: PLC0415 - heavy, and only this door needs it
+
+        additional = [self.folder / "detectors.add.xml", self.folder / "outputs.add.xml"]
+        detectors.write(self.network, additional[0], self.network.control_step_s)
+        write_outputs(additional[1])
+        arguments = run_arguments(
+            self.network.net_file, self.routes, additional, self.folder, self.seed, self.duration_s
+        )
+        try:
+            libsumo.start(["sumo", *arguments])
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            raise PlantError(
+                f"SUMO did not start ({_first_line(error)}): see {self.folder / 'sumo.log'}"
+            ) from error
+        SumoPlant._owner = self
+        self._sumo = libsumo
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._sumo.close()
+        self._sumo = None
+        SumoPlant._owner = None
+
+    @property
+    def version(self) -> str:
+        """SUMO's own version string."""
+        return str(self._sumo.getVersion()[1])
+
+    def run(self, plan: Plan) -> Measurement:
+        """Run one control step under `plan` and return what the detectors saw.
+
+        Each junction takes the plan over where its own cycle begins, and repeats it if its cycle is
+        shorter than the control step. Raises PlantError if SUMO breaks off.
+        """
+        end_s = min(self.time_s + self.network.control_step_s, self.duration_s)
+        peak_x = np.zeros(len(self.network.links))
+        peak_queue = np.zeros(len(self.network.links))
+        try:
+            while self.time_s < end_s:
+                for index, boundary_s in enumerate(self._boundary_s):
+                    if boundary_s == self.time_s:
+                        self._hand_over(index, plan.green_s)
+                        self._boundary_s[index] += self.network.junctions[index].cycle_s
+                sample_s = (self.time_s // SAMPLE_S + 1) * SAMPLE_S
+                self.time_s = min([sample_s, end_s, *self._boundary_s])
+                self._sumo.simulationStep(self.time_s)
+                x_veh = self._by_edge(self._sumo.edge.getLastStepVehicleNumber)
+                np.maximum(peak_x, x_veh, out=peak_x)
+                np.maximum(
+                    peak_queue, self._by_edge(self._sumo.edge.getLastStepHaltingNumber), out=peak_queue
+                )
+            waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
+            self.truth = Truth(x_veh, waiting, peak_x, peak_queue, self._sumo.vehicle.getIDCount())
+            return self._measure()
+        except (self._sumo.TraCIException, self._sumo.FatalTraCIError) as error:
+            raise PlantError(f"SUMO broke off at {self.time_s:g} s ({_first_line(error)})") from error
+
+    def _hand_over(self, index: int, green_s: Floats) -> None:
+        lights = self._sumo.trafficlight
+        junction = self.network.junctions[index]
+        phases = [
+            lights.Phase(float(duration), state) for state, duration in cycle_phases(self.network, index, green_s)
+        ]
+        lights.setProgramLogic(junction.id, lights.Logic(PROGRAM, 0, 0, phases))
+        lights.setProgram(junction.id, PROGRAM)
+        lights.setPhase(junction.id, 0)
+        lights.setPhaseDuration(junction.id, float(green_s[junction.stages[0]]))
+
+    def _by_edge(self, getter: Any) -> Floats:
+        return np.array([float(sum(map(getter, link.edges))) for link in self.network.links])
+
+    def _measure(self) -> Measurement:
+        loop, area = self._sumo.inductionloop, self._sumo.lanearea
+
+        def total(getter: Any, groups: Sequence[Sequence[str]]) -> Floats:
+            return np.array([float(sum(map(getter, group))) for group in groups])
+
+        counted, seen = loop.getLastIntervalVehicleNumber, area.getLastStepVehicleNumber
+        lanes = np.array([len(group) for group in self._ids.entry])
+        return Measurement(
+            time_s=self.time_s,
+            entered_veh=total(counted, self._ids.entry),
+            left_veh=total(counted, self._ids.stop_line),
+            to_edge_veh=total(counted, self._ids.to_edge),
+            queue_veh=total(area.getLastStepHaltingNumber, self._ids.area),
+            seen_veh=total(seen, self._ids.area),
+            entry_occupancy=total(loop.getLastIntervalOccupancy, self._ids.entry) / (100 * lanes),
+        )
+
+
+def cycle_phases(network: Network, junction: int, green_s: Floats) -> list[tuple[str, float]]:
+    """(letters, seconds) of one cycle of a junction under the given stage greens, clearances included."""
+    phases: list[tuple[str, float]] = []
+    for stage in network.junctions[junction].stages:
+        phases.append((network.stages[stage].state, float(green_s[stage])))
+        phases += network.stages[stage].clearance
+    return phases
+
+
+def write_outputs(path: Path) -> None:
+    """Additional file that makes SUMO record every signal switch beside its trips."""
+    path.write_text(
+        '<additional><timedEvent type="SaveTLSSwitchStates" dest="signals.xml"/></additional>\n', encoding="utf-8"
+    )
+
+
+def run_arguments(
+    net_file: Path, routes: Path, additional: Sequence[Path], folder: Path, seed: int, duration_s: float
+) -> list[str]:
+    """Options of a run, the same for libsumo and for the bare `sumo` binary, which makes replays equal."""
+    return [
+        "--net-file", str(net_file),
+        "--route-files", str(routes),
+        "--additional-files", ",".join(map(str, additional)),
+        "--begin", "0",
+        "--end", f"{duration_s:g}",
+        "--step-length", "1",
+        "--seed", str(seed),
+        "--time-to-teleport", "-1",
+        "--collision.action", "warn",
+        "--max-depart-delay", "-1",
+        "--tripinfo-output", str(folder / "trips.xml"),
+        "--tripinfo-output.write-unfinished",
+        "--tripinfo-output.write-undeparted",
+        "--statistic-output", str(folder / "statistics.xml"),
+        "--no-step-log",
+        "--duration-log.disable",
+        "--no-warnings",
+        "--error-log", str(folder / "sumo.log"),
+    ]  # fmt: skip
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
