@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,8 @@ __all__ = ["DistributedMPC", "Settings"]
 
 class DistributedMPC:
     """Chooses greens by a distributed model predictive control; settings as in `Settings`."""
+
+    Settings = Settings
 
     def __init__(self, network: Network, **settings: Any):
         self.settings = Settings(**settings)

@@ -8,6 +8,7 @@ junctions' boundaries the simulation jumps.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 from utn_sumo import detectors
 from utn_sumo.contract import Floats, Measurement, Network, Plan
 from utn_sumo.errors import PlantError
+from utn_sumo.signals import cycle_phases
 
 SAMPLE_S = 10.0
 """Rhythm in which the true state is sampled for the record (the paper's sampling interval)."""
@@ -39,6 +41,8 @@ class Truth:
     """(Z,) largest sampled number of halting vehicles on each link."""
     in_network_veh: int
     """Vehicles on any road at the end of the step."""
+    time_spent_veh_h: float
+    """Time that vehicles spent in the step, on the road or waiting to enter, from the samples."""
 
 
 class SumoPlant:
@@ -54,6 +58,8 @@ class SumoPlant:
         self.seed = seed
         self.duration_s = duration_s
         self.time_s = 0.0
+        self.sumo_time_s = 0.0
+        """Wall time spent inside SUMO: start, steps, close."""
         self.truth: Truth | None = None
         self._ids = detectors.ids(network)
         self._boundary_s = [junction.offset_s for junction in network.junctions]
@@ -71,12 +77,14 @@ class SumoPlant:
         arguments = run_arguments(
             self.network.net_file, self.routes, additional, self.folder, self.seed, self.duration_s
         )
+        started = time.perf_counter()
         try:
             libsumo.start(["sumo", *arguments])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
             raise PlantError(
                 f"SUMO did not start ({_first_line(error)}): see {self.folder / 'sumo.log'}"
             ) from error
+        self.sumo_time_s = time.perf_counter() - started
         SumoPlant._owner = self
         self._sumo = libsumo
         return self
@@ -84,7 +92,9 @@ class SumoPlant:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        started = time.perf_counter()
         self._sumo.close()
+        self.sumo_time_s += time.perf_counter() - started
         self._sumo = None
         SumoPlant._owner = None
 
@@ -103,24 +113,35 @@ class SumoPlant:
         peak_x = np.zeros(len(self.network.links))
         peak_queue = np.zeros(len(self.network.links))
         try:
+            spent_veh_s = 0.0
             while self.time_s < end_s:
+                before_s = self.time_s
                 for index, boundary_s in enumerate(self._boundary_s):
                     if boundary_s == self.time_s:
                         self._hand_over(index, plan.green_s)
                         self._boundary_s[index] += self.network.junctions[index].cycle_s
                 sample_s = (self.time_s // SAMPLE_S + 1) * SAMPLE_S
                 self.time_s = min([sample_s, end_s, *self._boundary_s])
-                self._sumo.simulationStep(self.time_s)
+                self._step()
                 x_veh = self._by_edge(self._sumo.edge.getLastStepVehicleNumber)
                 np.maximum(peak_x, x_veh, out=peak_x)
+                waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
+                present = self._sumo.vehicle.getIDCount() + waiting.sum()
+                spent_veh_s += present * (self.time_s - before_s)
                 np.maximum(
                     peak_queue, self._by_edge(self._sumo.edge.getLastStepHaltingNumber), out=peak_queue
                 )
-            waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
-            self.truth = Truth(x_veh, waiting, peak_x, peak_queue, self._sumo.vehicle.getIDCount())
+            self.truth = Truth(
+                x_veh, waiting, peak_x, peak_queue, self._sumo.vehicle.getIDCount(), spent_veh_s / 3600
+            )
             return self._measure()
         except (self._sumo.TraCIException, self._sumo.FatalTraCIError) as error:
             raise PlantError(f"SUMO broke off at {self.time_s:g} s ({_first_line(error)})") from error
+
+    def _step(self) -> None:
+        started = time.perf_counter()
+        self._sumo.simulationStep(self.time_s)
+        self.sumo_time_s += time.perf_counter() - started
 
     def _hand_over(self, index: int, green_s: Floats) -> None:
         lights = self._sumo.trafficlight
@@ -153,15 +174,6 @@ class SumoPlant:
             seen_veh=total(seen, self._ids.area),
             entry_occupancy=total(loop.getLastIntervalOccupancy, self._ids.entry) / (100 * lanes),
         )
-
-
-def cycle_phases(network: Network, junction: int, green_s: Floats) -> list[tuple[str, float]]:
-    """(letters, seconds) of one cycle of a junction under the given stage greens, clearances included."""
-    phases: list[tuple[str, float]] = []
-    for stage in network.junctions[junction].stages:
-        phases.append((network.stages[stage].state, float(green_s[stage])))
-        phases += network.stages[stage].clearance
-    return phases
 
 
 def write_outputs(path: Path) -> None:

@@ -1,0 +1,182 @@
+"""The loop: plant -> detectors -> estimate -> forecast -> plan -> checked programme -> plant."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import utn_sumo
+from utn_sumo import controllers, demand, metrics, monitor, network, recording
+from utn_sumo.contract import Floats
+from utn_sumo.estimation import CountingEstimator
+from utn_sumo.plant.sumo import SumoPlant
+from utn_sumo.prediction import ProfileForecast
+from utn_sumo.scenario import Scenario
+from utn_sumo.supervisor import Decision, Supervisor
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is, for whoever watches it."""
+
+    time_s: float
+    duration_s: float
+    time_spent_veh_h: float
+    queue_veh: float
+
+
+def run(
+    scenario: Scenario, folder: Path | None = None, on_cycle: Callable[[Progress], None] | None = None
+) -> dict[str, Any]:
+    """Run a scenario and return its measures under the names of SPEC 7; everything else is in the folder.
+
+    A KeyboardInterrupt ends the run early with a whole, readable result that says so. Raises UtnError.
+    """
+    net = network.load(scenario.net)
+    controller = controllers.build(scenario.controller, net, scenario.settings)
+    folder = recording.new_folder(folder, _default_name(scenario))
+    step_s, duration_s = net.control_step_s, scenario.duration_s
+    steps = int(np.ceil(duration_s / step_s))
+    routes = folder / "routes.rou.xml"
+    shutil.copyfile(
+        demand.route_file(
+            net,
+            profile=scenario.profile,
+            duration_s=duration_s,
+            step_s=step_s,
+            scale=scenario.demand,
+            noise=scenario.noise,
+            seed=scenario.seed,
+        ),
+        routes,
+    )
+    shutil.copyfile(net.net_file, folder / "net.net.xml")
+    profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
+    predictor = ProfileForecast(profile_veh_h * step_s / 3600)
+    estimator = CountingEstimator(net)
+    supervisor = Supervisor(net, controller)
+    tally = _Tally()
+    interrupted = False
+
+    with SumoPlant(net, routes, folder, seed=scenario.seed, duration_s=duration_s) as plant:
+        # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
+        started, start_s = time.perf_counter(), plant.sumo_time_s
+        recorder = recording.Recorder(folder, {"scenario": scenario.model_dump(), "versions": _versions(plant.version)})
+        state = estimator.initial()
+        try:
+            for step in range(steps):
+                ahead = predictor.forecast(step, controller.horizon)
+                decision = supervisor.ask(state, ahead)
+                seen = plant.run(decision.plan)
+                recorder.write(
+                    {
+                        "cycle": step,
+                        "state": state,
+                        "forecast": ahead,
+                        "decision": decision,
+                        "seen": seen,
+                        "truth": plant.truth,
+                    }
+                )
+                state = estimator.update(seen, predictor.expected_veh(step))
+                tally.add(decision, plant, seen.left_veh)
+                if on_cycle:
+                    queue_veh = float(seen.queue_veh.sum() + state.source_queue_veh.sum())
+                    on_cycle(Progress(plant.time_s, duration_s, tally.time_spent_veh_h, queue_veh))
+        except KeyboardInterrupt:
+            interrupted = True
+    verdict = monitor.watch(net, folder / "signals.xml", plant.time_s)
+    trips = metrics.trip_measures(folder / "trips.xml")
+    elapsed_s = time.perf_counter() - started
+    result = {
+        "controller": scenario.controller,
+        "net": scenario.net,
+        "demand": scenario.demand,
+        "seed": scenario.seed,
+        "hours": plant.time_s / 3600,
+        **trips,
+        "max_queue_veh": tally.max_queue_veh,
+        "max_vehicles_veh": tally.max_vehicles_veh,
+        "over_storage_veh": tally.over_storage_veh(net.storage_veh),
+        "teleports": metrics.teleports(folder / "statistics.xml"),
+        "gridlock": metrics.gridlocked(net, tally.x_veh, tally.left_veh, tally.green_s),
+        "unsafe_signal_s": verdict.unsafe_signal_s,
+        "fallbacks": tally.fallbacks,
+        "sumo_time_s": plant.sumo_time_s,
+        "control_time_s": tally.control_time_s,
+        "bridge_time_s": elapsed_s - (plant.sumo_time_s - start_s) - tally.control_time_s,
+        "interrupted": interrupted,
+        "unsafe_reasons": verdict.reasons[:20],
+        "fallback_reasons": tally.fallback_reasons[:20],
+        "out": str(folder),
+    }
+    recorder.close(result)
+    return result
+
+
+class _Tally:
+    """What the run adds up as it goes."""
+
+    def __init__(self) -> None:
+        self.control_time_s = 0.0
+        self.time_spent_veh_h = 0.0
+        self.fallbacks = 0
+        self.fallback_reasons: list[str] = []
+        self.x_veh: list[Floats] = []
+        self.left_veh: list[Floats] = []
+        self.green_s: list[Floats] = []
+        self._max_x_veh: list[Floats] = []
+        self._max_queue_veh: list[Floats] = []
+
+    def add(self, decision: Decision, plant: SumoPlant, left_veh: Floats) -> None:
+        truth = plant.truth
+        assert truth is not None
+        self.control_time_s += decision.control_time_s
+        if decision.rung != "solved":
+            self.fallbacks += 1
+            self.fallback_reasons.append(f"at {plant.time_s:g} s {decision.rung}: {decision.reason}")
+        self.time_spent_veh_h += truth.time_spent_veh_h
+        self.x_veh.append(truth.x_veh)
+        self.left_veh.append(left_veh)
+        self.green_s.append(decision.plan.green_s)
+        self._max_x_veh.append(truth.max_x_veh)
+        self._max_queue_veh.append(truth.max_queue_veh)
+
+    @property
+    def max_vehicles_veh(self) -> float:
+        """Most vehicles on one link."""
+        return float(np.max(self._max_x_veh, initial=0.0))
+
+    @property
+    def max_queue_veh(self) -> float:
+        """Most standing vehicles on one link."""
+        return float(np.max(self._max_queue_veh, initial=0.0))
+
+    def over_storage_veh(self, storage_veh: Floats) -> float:
+        """Most vehicles on one link beyond its storage."""
+        if not self._max_x_veh:
+            return 0.0
+        return float(np.max(np.array(self._max_x_veh) - storage_veh, initial=0.0))
+
+
+def _default_name(scenario: Scenario) -> str:
+    net, controller = (Path(part.partition(":")[0]).name.partition(".")[0] for part in (scenario.net, scenario.controller))
+    return f"{net}-{controller}-demand{scenario.demand:g}-seed{scenario.seed}"
+
+
+def _versions(sumo: str) -> dict[str, str]:
+    packages = ("libsumo", "sumolib", "casadi", "daqp", "numpy")
+    return {
+        "utn_sumo": utn_sumo.__version__,
+        "sumo": sumo,
+        "python": platform.python_version(),
+        **{package: version(package) for package in packages},
+    }

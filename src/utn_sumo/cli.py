@@ -1,0 +1,140 @@
+"""The `utn` command. Heavy imports happen inside the commands, so that `utn --help` answers at once."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from utn_sumo import __version__
+from utn_sumo.errors import SettingError, UtnError
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="utn")
+def cli() -> None:
+    """Model-based traffic-signal control on the SUMO microsimulator."""
+
+
+@cli.command()
+@click.option("--net", help="Shipped network, or a .net.xml file.  [utn17]")
+@click.option("--controller", help="Registered controller, or path.py:Class.  [dmpc]")
+@click.option("--hours", help="Simulated hours.  [4]")
+@click.option("--demand", help="Scale of the demand profile.  [1.0]")
+@click.option("--profile", help="Demand profile: peak, paper or constant.  [peak]")
+@click.option("--noise", help="Relative standard deviation of correlated demand noise.  [0]")
+@click.option("--seed", help="Seed of demand and SUMO.  [1]")
+@click.option("--horizon", help="Prediction horizon Kp of a predictive controller, in cycles.  [7]")
+@click.option("--control-horizon", help="Control horizon Kc, in cycles.  [4]")
+@click.option("--cost", help="Cost of a predictive controller: tts or paper.  [tts]")
+@click.option("--set", "pairs", multiple=True, metavar="NAME=VALUE", help="Any other setting of the controller.")
+@click.option("--scenario", "file", type=click.Path(path_type=Path), help="TOML file with these settings.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
+@click.option("--json", "as_json", is_flag=True, help="Print the measures as one JSON object, and nothing else.")
+def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bool, **flags: str | None) -> None:
+    """Run a controller on a network in SUMO and measure it."""
+    from utn_sumo import bridge, report  # noqa: PLC0415 - heavy
+    from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy
+
+    settings = {name: flags.pop(name) for name in ("horizon", "control_horizon", "cost")}
+    settings = {name: _number(value) for name, value in settings.items() if value is not None}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals:
+            raise SettingError(f"--set {pair!r}: write it as NAME=VALUE")
+        settings[name.strip()] = _number(value.strip())
+    given: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
+    chosen = scenario(file, settings=settings, **given)
+    with report.progress(chosen) as on_cycle:
+        result = bridge.run(chosen, out, on_cycle)
+    click.echo(json.dumps(result)) if as_json else report.table(result)
+    if result["interrupted"]:
+        raise KeyboardInterrupt
+
+
+@cli.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+def replay(folder: Path) -> None:
+    """Write the signals of the run in FOLDER as plain SUMO files that the bare `sumo` replays."""
+    from utn_sumo import replay as writer  # noqa: PLC0415 - heavy
+
+    configuration = writer.write(folder)
+    click.echo(f"wrote {configuration}: run it with  sumo -c {configuration}")
+
+
+@cli.command()
+def controllers() -> None:
+    """List the registered controllers and their settings."""
+    from utn_sumo.controllers import registered, settings_of  # noqa: PLC0415 - heavy
+
+    for name, point in registered().items():
+        factory = point.load()
+        click.echo(f"{name}: {(factory.__doc__ or '').strip().splitlines()[0]}")
+        names = settings_of(factory)
+        click.echo(f"    settings: {', '.join(names) if names else 'none'}")
+
+
+@cli.group()
+def net() -> None:
+    """The shipped networks: build them anew, or check them."""
+
+
+@net.command("build")
+def net_build() -> None:
+    """Write the shipped networks from their topology through netconvert."""
+    builder = _builder()
+    for path in builder.build(builder.ROOT):
+        click.echo(path.relative_to(builder.ROOT.parent))
+
+
+@net.command("check")
+def net_check() -> None:
+    """Rebuild the shipped networks aside and compare, byte for byte but for netconvert's header."""
+    differing = _builder().check()
+    if differing:
+        raise UtnError(f"shipped networks differ from their topology: {', '.join(differing)}; run utn net build")
+    click.echo("the shipped networks are what their topology gives")
+
+
+def _builder() -> Any:
+    import utn_network  # noqa: PLC0415
+
+    path = Path(utn_network.__file__).resolve().parents[1] / "build.py"
+    if not path.is_file():
+        raise UtnError("networks are built from a checkout of the project: this is an installed package")
+    spec = importlib.util.spec_from_file_location("utn_net_build", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _number(text: str | None) -> Any:
+    """The value that JSON reads in a flag's text, else the text: 7, 0.1, true, tts."""
+    try:
+        return json.loads(text or "")
+    except json.JSONDecodeError:
+        return text
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point: every error that is the user's to mend is one line and exit code 2; 130 after Ctrl-C."""
+    try:
+        cli.main(args=arguments, prog_name="utn", standalone_mode=False)
+    except UtnError as error:
+        _fail(str(error))
+    except click.UsageError as error:
+        _fail(f"{' '.join(error.format_message().split())}: see utn --help")
+    except (click.exceptions.Abort, KeyboardInterrupt):
+        click.echo("utn: stopped; what was reached is on disk", err=True)
+        sys.exit(130)
+
+
+def _fail(line: str) -> None:
+    click.echo(f"utn: {line}", err=True)
+    sys.exit(2)

@@ -1,0 +1,64 @@
+"""A scenario: everything that determines a run. A TOML file, flags and keyword arguments say the same things."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from utn_sumo.errors import SettingError, did_you_mean
+
+
+class Scenario(BaseModel):
+    """Settings of one run; each is checked here, once."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    net: str = "utn17"
+    """A shipped network's name, or the path of a .net.xml."""
+    controller: str = "dmpc"
+    """A registered controller's name, or `path.py:Class`."""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """The controller's own settings."""
+    hours: float = Field(4.0, gt=0, le=240)
+    demand: float = Field(1.0, ge=0, le=10)
+    """Scales the demand profile."""
+    profile: Literal["peak", "paper", "constant"] = "peak"
+    noise: float = Field(0.0, ge=0, le=2)
+    """Standard deviation of the correlated noise on the demand, relative."""
+    seed: int = Field(1, ge=0, le=2**31 - 1)
+
+    @property
+    def duration_s(self) -> float:
+        return round(self.hours * 3600)
+
+
+def scenario(file: Path | None = None, **given: Any) -> Scenario:
+    """A checked scenario from a TOML file (where one is named) and what is given beside it, which wins.
+
+    Raises SettingError with one line that names the setting, its value and the remedy.
+    """
+    values: dict[str, Any] = {}
+    if file is not None:
+        try:
+            values = tomllib.loads(file.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise SettingError(f"scenario file {str(file)!r} can't be read ({error})") from error
+    settings = {**values.get("settings", {}), **given.pop("settings", {})}
+    try:
+        return Scenario(**{**values, **given, "settings": settings})
+    except ValidationError as error:
+        raise SettingError(explain(error, Scenario.model_fields)) from error
+
+
+def explain(error: ValidationError, known: Iterable[str]) -> str:
+    """The first complaint of a validation in one line: the setting, its value, the remedy."""
+    first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"setting {name!r} is unknown: {did_you_mean(name, known)}"
+    remedy = first["msg"][0].lower() + first["msg"][1:]
+    return f"setting {name!r} is {first['input']!r}: {remedy.replace('input should be', 'it must be')}"

@@ -1,0 +1,85 @@
+"""Plan to signal programme: whole seconds, clearances, and a last check that refuses with a reason.
+
+SUMO shows whatever it is told (FINDINGS 1), so nothing reaches it that this module has not admitted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from utn_sumo.contract import Floats, Network, Plan
+from utn_sumo.errors import PlanError
+
+TOLERANCE_S = 1e-3
+"""How far a wished plan may be from its budget and its least greens: solvers leave that much."""
+
+
+def admit(plan: Plan, network: Network) -> Plan:
+    """The plan in whole seconds, safe to show. Raises PlanError with the reason if it is not.
+
+    Checked are its shape, that it is finite, each stage's least green, each junction's sum against
+    what its cycle leaves, and then the programme that results from it.
+    """
+    green_s = np.asarray(plan.green_s, dtype=float)
+    if green_s.shape != (len(network.stages),):
+        raise PlanError(f"plan has shape {green_s.shape}: give one green for each of {len(network.stages)} stages")
+    if not np.isfinite(green_s).all():
+        raise PlanError(f"plan is not finite at stage {int(np.flatnonzero(~np.isfinite(green_s))[0])}")
+    for index, junction in enumerate(network.junctions):
+        stages = list(junction.stages)
+        short = green_s[stages].min()
+        if short < junction.min_green_s - TOLERANCE_S:
+            raise PlanError(f"junction {junction.id}: green of {short:g} s is under the {junction.min_green_s:g} s least")
+        total, budget = green_s[stages].sum(), network.green_budget_s[index]
+        if abs(total - budget) > TOLERANCE_S * len(stages):
+            raise PlanError(f"junction {junction.id}: greens sum to {total:g} s, its cycle leaves {budget:g} s")
+    admitted = replace(plan, green_s=whole_seconds(network, green_s))
+    for index in range(len(network.junctions)):
+        check_programme(network, index, cycle_phases(network, index, admitted.green_s))
+    return admitted
+
+
+def whole_seconds(network: Network, green_s: Floats) -> Floats:
+    """Greens rounded to whole seconds that still sum to each junction's budget (largest remainder)."""
+    rounded = np.floor(green_s + TOLERANCE_S)
+    for index, junction in enumerate(network.junctions):
+        stages = np.array(junction.stages)
+        missing = round(network.green_budget_s[index] - rounded[stages].sum())
+        by_remainder = stages[np.argsort(rounded[stages] - green_s[stages], kind="stable")]
+        rounded[by_remainder[:missing]] += 1
+    return rounded
+
+
+def cycle_phases(network: Network, junction: int, green_s: Floats) -> list[tuple[str, float]]:
+    """(letters, seconds) of one cycle of a junction under the stage greens (S,), clearances included."""
+    phases: list[tuple[str, float]] = []
+    for stage in network.junctions[junction].stages:
+        phases.append((network.stages[stage].state, float(green_s[stage])))
+        phases += network.stages[stage].clearance
+    return phases
+
+
+def check_programme(network: Network, junction: int, phases: list[tuple[str, float]]) -> None:
+    """Raise PlanError unless the phases fill the cycle in whole seconds and clear every green by yellow."""
+    item = network.junctions[junction]
+    total = sum(duration for _, duration in phases)
+    if total != item.cycle_s:
+        raise PlanError(f"junction {item.id}: programme lasts {total:g} s, its cycle {item.cycle_s:g} s")
+    for state, duration in phases:
+        if duration < 1 or duration != round(duration):
+            raise PlanError(f"junction {item.id}: phase of {duration:g} s, whole seconds from 1 on are needed")
+        if len(state) != len(item.signal_turn):
+            raise PlanError(f"junction {item.id}: {len(state)} letters for {len(item.signal_turn)} signals")
+        greens = [i for i, letter in enumerate(state) if letter == "G"]
+        for a in greens:
+            for b in greens:
+                if item.conflicts[a][b]:
+                    raise PlanError(f"junction {item.id}: signals {a} and {b} conflict and are both green")
+    states = [state for state, _ in phases]
+    for before, after in pairwise([*states, states[0]]):
+        for signal, (was, becomes) in enumerate(zip(before, after, strict=True)):
+            if was in "Gg" and becomes == "r":
+                raise PlanError(f"junction {item.id}: signal {signal} goes from green to red without yellow")

@@ -1,0 +1,59 @@
+"""The fallback ladder: solved plan, else the rest of the last good one, else the backup plan. Never raises.
+
+Every rung is admitted by `signals` before it is given out, so that a controller, ours or a user's, can't bring the
+run down or an unsafe plan onto the street.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+from utn_sumo import signals
+from utn_sumo.contract import Controller, Forecast, Network, Plan, State
+from utn_sumo.errors import PlanError
+
+Rung = Literal["solved", "shifted", "backup"]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The plan that goes to the plant, where it came from, and why not from higher up."""
+
+    plan: Plan
+    rung: Rung
+    reason: str
+    """Empty for a solved plan."""
+    control_time_s: float
+    """Wall time of the controller."""
+
+
+class Supervisor:
+    """Asks one controller, cycle by cycle."""
+
+    def __init__(self, network: Network, controller: Controller):
+        self.network = network
+        self.controller = controller
+        self._ahead: list[Plan] = []
+        """What the last solved plan foresaw, next cycle first."""
+
+    def ask(self, state: State, forecast: Forecast) -> Decision:
+        """A plan that is safe to apply, whatever the controller does."""
+        started = time.perf_counter()
+        try:
+            wish = self.controller.plan(state, forecast)
+            plan = signals.admit(wish, self.network)
+        except Exception as error:  # noqa: BLE001 - a foreign controller may raise anything
+            reason = f"{type(error).__name__}: {error}"
+        else:
+            ahead = [] if wish.ahead_s is None else [Plan(green_s) for green_s in wish.ahead_s]
+            self._ahead = ahead
+            return Decision(plan, "solved", "", time.perf_counter() - started)
+        spent_s = time.perf_counter() - started
+        if self._ahead:
+            try:
+                return Decision(signals.admit(self._ahead.pop(0), self.network), "shifted", reason, spent_s)
+            except PlanError as error:
+                reason = f"{reason}; the last plan's rest: {error}"
+        return Decision(self.network.equal_split(), "backup", reason, spent_s)
