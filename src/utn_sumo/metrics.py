@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree  # only for the files that our own SUMO has just written
 
 import numpy as np
 
@@ -19,8 +20,6 @@ def trip_measures(trips: Path) -> dict[str, Any]:
     loss plus that wait, `mean_delay_s` the same a vehicle; `mean_travel_time_s` is entry to arrival
     with the wait before it, over the vehicles that arrived; `stops` counts halts.
     """
-    from defusedxml import ElementTree  # noqa: PLC0415
-
     spent = delay = travel = 0.0
     vehicles = arrived = stops = 0
     try:
@@ -51,8 +50,6 @@ def trip_measures(trips: Path) -> dict[str, Any]:
 
 def teleports(statistics: Path) -> int:
     """Vehicles that SUMO teleported, from its statistics output."""
-    from defusedxml import ElementTree  # noqa: PLC0415
-
     try:
         element = ElementTree.parse(statistics).find("teleports")
     except (OSError, ElementTree.ParseError) as error:

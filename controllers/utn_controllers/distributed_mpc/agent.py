@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from utn_controllers.distributed_mpc.problem import JunctionProblem, QuadraticProgram
@@ -32,46 +34,53 @@ class Agent:
         self._shape = (len(self.interactions), horizon)
         self.program: QuadraticProgram | None = None
         self.solution: Floats = np.zeros(problem.layout.size)
-        self._solver: object = None
+        self._solver: Any = None
         self._rho = 0.0
 
     def prepare(self, state: State, forecast: Forecast, rho: float) -> None:
-        """Take up a new state: the local programme, factorised for this `rho`."""
+        """Take up a new state. The Hessian is factorised once for each `rho`; later states only bring vectors
+        and the constraint matrix, and the solver starts from the last active set."""
         self.program = self.problem.program(state, forecast)
-        self.factorise(rho)
+        if self._solver is None or rho != self._rho:
+            self.factorise(rho)
+        else:
+            self._solver.update(A=self.program.matrix, bupper=self.program.upper, blower=self.program.lower)
 
     def factorise(self, rho: float) -> None:
-        """Set the solver up for another `rho`."""
+        """Set the solver up for a penalty `rho`, without a memory of earlier states."""
         import daqp  # noqa: PLC0415 - compiled, loaded at use
 
-        program = self.program
-        assert program is not None
+        program = self._program()
         sense = np.zeros(len(program.upper), dtype=np.int32)
         sense[program.lower == program.upper] = EQUALITY
         self._rho = rho
         self._solver = daqp.Model()
         flag, _ = self._solver.setup(
-            program.hessian + rho * self._gram,
-            program.gradient,
-            program.matrix,
-            np.minimum(program.upper, 1e30),
-            np.maximum(program.lower, -1e30),
-            sense,
+            program.hessian + rho * self._gram, program.gradient, program.matrix, program.upper, program.lower, sense
         )
         if flag < 0:
             raise ControllerError(f"agent {self.problem.part.name}: the solver refused its problem (flag {flag})")
+
+    def _program(self) -> QuadraticProgram:
+        if self.program is None:
+            raise ControllerError(f"agent {self.problem.part.name}: prepare() comes before solve()")
+        return self.program
 
     def solve(self, mean: Floats, price: Floats) -> Floats:
         """Best answer to the interactions' means and prices; (n, Kp) copies of their flows [veh].
 
         `mean` and `price` (n, Kp) are zb and lam of this agent's interactions.
         """
-        program = self.program
-        assert program is not None
         linear = (self.sign[:, None] * price - self._rho * mean).ravel()
-        self._solver.update(f=program.gradient + self._coupling.T @ linear)
+        gradient = self._program().gradient + self._coupling.T @ linear
+        self._solver.update(f=gradient)
         solution, _, flag, _ = self._solver.solve()
+        if flag not in OPTIMAL:
+            # The active set of another state can lead the solver astray: once more, cold.
+            self.factorise(self._rho)
+            self._solver.update(f=gradient)
+            solution, _, flag, _ = self._solver.solve()
         if flag not in OPTIMAL or not np.isfinite(solution).all():
             raise ControllerError(f"agent {self.problem.part.name}: no optimum (flag {flag})")
         self.solution = solution
-        return (self._coupling @ solution).reshape(self._shape)
+        return np.asarray(self._coupling @ solution).reshape(self._shape)

@@ -17,9 +17,8 @@ if TYPE_CHECKING:
     from utn_controllers.distributed_mpc.agent import Agent
 
 ADAPT_RATIO = 10.0
+"""The penalty adapts while one residual is this many times the other, then it is frozen for good."""
 ADAPT_FACTOR = 2.0
-ADAPT_ITERATIONS = 5
-"""The penalty adapts in the first iterations of the first steps, then it is frozen."""
 BYTES_PER_NUMBER = 8
 
 
@@ -32,6 +31,8 @@ class Consensus:
     price: Floats
     """(interactions, Kp) lam."""
     rho: float
+    frozen: bool = False
+    """Whether rho has settled."""
 
     def shift(self) -> None:
         """One control step on: everything moves up by a step, and the last one is repeated."""
@@ -85,4 +86,19 @@ def admm(agents: list[Agent], consensus: Consensus, settings: Settings) -> Outco
         )
         if converged:
             break
+        if not consensus.frozen:
+            _adapt(agents, consensus, primal, dual)
     return Outcome(iteration, primal, dual, converged, 2 * iteration * numbers * BYTES_PER_NUMBER)
+
+
+def _adapt(agents: list[Agent], consensus: Consensus, primal: float, dual: float) -> None:
+    """Move rho towards balanced residuals; the first time that they are balanced, freeze it."""
+    if primal > ADAPT_RATIO * dual:
+        consensus.rho *= ADAPT_FACTOR
+    elif dual > ADAPT_RATIO * primal:
+        consensus.rho /= ADAPT_FACTOR
+    else:
+        consensus.frozen = True
+        return
+    for agent in agents:
+        agent.factorise(consensus.rho)

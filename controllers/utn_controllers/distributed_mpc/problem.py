@@ -81,7 +81,7 @@ class JunctionProblem:
         self._numbers = LinkModel(self.part, network.control_step_s)
         self._lags = network.delay_steps
         self.model.lags = self._numbers.lags = self._lags
-        self._evaluate = self._state_problem()
+        self._bind(self._state_problem())
 
     def consumed(self) -> list[int]:
         """Links of this junction that a neighbour feeds."""
@@ -121,15 +121,27 @@ class JunctionProblem:
                 self.network.fraction[self.turns],
             ]
         )
-        outputs = self._evaluate(parameters)
-        hessian, gradient, matrix, lower, upper, constant = (np.array(value.full()) for value in outputs)
-        return QuadraticProgram(
-            hessian, gradient.ravel(), matrix, lower.ravel(), upper.ravel(), float(constant[0, 0])
-        )
+        self._parameters[:] = parameters
+        self._run()
+        constant = float(self._results[-1][0])
+        hessian, gradient, matrix, lower, upper = (array.copy() for array in self._results[:-1])
+        return QuadraticProgram(hessian, gradient, matrix, lower, upper, constant)
 
     def greens(self, solution: Floats) -> Floats:
         """(Kc, S of this junction) greens [s] of a solution."""
         return solution[self.layout.green]
+
+    def _bind(self, function: Any) -> None:
+        """Tie a CasADi function to arrays of ours: calling it then costs its arithmetic and nothing else."""
+        self._parameters = np.zeros(function.size1_in(0))
+        shapes = [function.size_out(i) for i in range(function.n_out())]
+        # CasADi writes dense outputs by column: Fortran order; vectors come out flat.
+        self._results = [np.zeros(shape, order="F") if shape[1] > 1 else np.zeros(shape[0]) for shape in shapes]
+        self._function = function
+        self._buffer, self._run = function.buffer()
+        self._buffer.set_arg(0, memoryview(self._parameters))
+        for position, array in enumerate(self._results):
+            self._buffer.set_res(position, memoryview(array.T if array.ndim == 2 else array))
 
     def _state_problem(self) -> Any:
         """CasADi function: parameters -> Hessian, gradient, constraint matrix, bounds, constant."""
@@ -194,18 +206,15 @@ class JunctionProblem:
         size = self.layout.size
         offset = at_zero[size : size + expressions.numel()]
         bounds = self._simple_bounds()
-        return ca.Function(
-            "problem",
-            [ca.vertcat(*parameters)],
-            [
-                hessian,
-                at_zero[:size],
-                matrix,
-                ca.vertcat(bounds[0], lower - offset),
-                ca.vertcat(bounds[1], upper - offset),
-                at_zero[-1],
-            ],
-        )
+        outputs = [
+            hessian,
+            at_zero[:size],
+            matrix,
+            ca.vertcat(bounds[0], lower - offset),
+            ca.vertcat(bounds[1], upper - offset),
+            at_zero[-1],
+        ]
+        return ca.Function("problem", [ca.vertcat(*parameters)], [ca.densify(ca.SX(item)) for item in outputs])
 
     def _simple_bounds(self) -> tuple[Floats, Floats]:
         lower, upper = np.zeros(self.layout.size), np.full(self.layout.size, np.inf)
