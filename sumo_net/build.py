@@ -1,7 +1,7 @@
 """Build the shipped networks from the topology of SPEC 1: plain XML, netconvert, detectors, manifest.
 
-    utn net build            write them
-    utn net check            build into a temporary folder and compare with what is shipped
+utn net build            write them
+utn net check            build into a temporary folder and compare with what is shipped
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT))
 
 import topology  # noqa: E402 - beside this script, not in a package
-
 from utn_sumo import detectors, network  # noqa: E402
 from utn_sumo.errors import UtnError  # noqa: E402
 from utn_sumo.sumo_tools import sumo_binary  # noqa: E402
@@ -43,8 +42,7 @@ def build(target: Path) -> list[Path]:
         written += _netconvert(name, plain, target / "utn_network")
     manifest = target / "utn_network" / "manifest.json"
     manifest.write_text(
-        json.dumps({path.name: digest(path) for path in written if path.parent == manifest.parent}, indent=1)
-        + "\n",
+        json.dumps({path.name: digest(path) for path in written if path.parent == manifest.parent}, indent=1) + "\n",
         encoding="utf-8",
     )
     return [*written, manifest]
@@ -85,13 +83,9 @@ def check() -> list[str]:
         target = Path(folder)
         fresh = {path.relative_to(target): content(path) for path in build(target)}
     differing = [
-        str(name)
-        for name, data in sorted(fresh.items())
-        if not (ROOT / name).is_file() or content(ROOT / name) != data
+        str(name) for name, data in sorted(fresh.items()) if not (ROOT / name).is_file() or content(ROOT / name) != data
     ]
     stray = {
-        path.relative_to(ROOT)
-        for pattern in ("plain/*/*.xml", "utn_network/*.xml")
-        for path in ROOT.glob(pattern)
+        path.relative_to(ROOT) for pattern in ("plain/*/*.xml", "utn_network/*.xml") for path in ROOT.glob(pattern)
     } - set(fresh)
     return differing + sorted(f"{name} (not built any more)" for name in stray)

@@ -56,9 +56,7 @@ def write_plain(name: str, folder: Path) -> None:
     types = ET.Element("types")
     turns = ET.Element("data")
     interval = ET.SubElement(turns, "interval", id="turning", begin="0", end="1000000")
-    ET.SubElement(
-        types, "type", id="street", numLanes=str(LANES), speed=f"{FREE_SPEED_M_S:.4f}", priority="1"
-    )
+    ET.SubElement(types, "type", id="street", numLanes=str(LANES), speed=f"{FREE_SPEED_M_S:.4f}", priority="1")
 
     def node(node_id: str, x: float, y: float, kind: str) -> None:
         ET.SubElement(nodes, "node", id=node_id, x=f"{x * unit:.2f}", y=f"{y * unit:.2f}", type=kind)
@@ -89,6 +87,4 @@ def write_plain(name: str, folder: Path) -> None:
         (nodes, "nod"), (edges, "edg"), (connections, "con"), (types, "typ"), (turns, "turns"),
     ):  # fmt: skip
         ET.indent(root)
-        (folder / f"{name}.{suffix}.xml").write_text(
-            ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8"
-        )
+        (folder / f"{name}.{suffix}.xml").write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")

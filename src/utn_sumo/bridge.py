@@ -168,7 +168,9 @@ class _Tally:
 
 
 def _default_name(scenario: Scenario) -> str:
-    net, controller = (Path(part.partition(":")[0]).name.partition(".")[0] for part in (scenario.net, scenario.controller))
+    net, controller = (
+        Path(part.partition(":")[0]).name.partition(".")[0] for part in (scenario.net, scenario.controller)
+    )
     return f"{net}-{controller}-demand{scenario.demand:g}-seed{scenario.seed}"
 
 

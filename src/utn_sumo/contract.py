@@ -167,10 +167,7 @@ class Network:
     def green_budget_s(self) -> Floats:
         """(J,) green that a cycle can give away: the cycle less the lost time L_j (SPEC 3)."""
         return np.array(
-            [
-                junction.cycle_s - sum(self.stages[s].clearance_s for s in junction.stages)
-                for junction in self.junctions
-            ]
+            [junction.cycle_s - sum(self.stages[s].clearance_s for s in junction.stages) for junction in self.junctions]
         )
 
     @cached_property

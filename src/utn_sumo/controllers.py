@@ -35,7 +35,9 @@ def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
     except ValidationError as error:
         raise SettingError(f"controller {name!r}: {explain(error, takes)}") from error
     if not isinstance(controller, Controller):
-        raise ControllerError(f"controller {name!r} lacks `horizon` or `plan(state, forecast)`: see contract.Controller")
+        raise ControllerError(
+            f"controller {name!r} lacks `horizon` or `plan(state, forecast)`: see contract.Controller"
+        )
     return controller
 
 

@@ -41,9 +41,7 @@ def mean_profile_veh_h(network: Network, profile: str, steps: int, scale: float)
     return scale * shape[:, None] * network.is_source[None, :]
 
 
-def drawn_rates_veh_h(
-    network: Network, profile: str, steps: int, scale: float, noise: float, seed: int
-) -> Floats:
+def drawn_rates_veh_h(network: Network, profile: str, steps: int, *, scale: float, noise: float, seed: int) -> Floats:
     """(steps, Z) the demand rates of one seed: the mean profile, the paper's draw each step, the noise.
 
     `noise` is the standard deviation of a multiplicative disturbance correlated in time and among sources.
@@ -89,7 +87,7 @@ def route_file(
     if path.is_file():
         return path
     steps = int(np.ceil(duration_s / step_s))
-    rates = drawn_rates_veh_h(network, profile, steps, scale, noise, seed)
+    rates = drawn_rates_veh_h(network, profile, steps, scale=scale, noise=noise, seed=seed)
     trips = _trips(network, rates, step_s, duration_s, seed)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".part", delete=False, encoding="utf-8") as part:
@@ -117,8 +115,10 @@ def _trips(
         departures = np.concatenate(
             [step * step_s + np.sort(rng.uniform(0, step_s, n)) for step, n in enumerate(counts)]
         )
-        for depart_s in departures[departures < duration_s]:
-            trips.append((float(depart_s), int(source), _route(network, int(source), turns_of, cumulative, rng)))
+        trips += [
+            (float(depart_s), int(source), _route(network, int(source), turns_of, cumulative, rng))
+            for depart_s in departures[departures < duration_s]
+        ]
     trips.sort(key=lambda trip: trip[:2])
     return [(depart_s, edges) for depart_s, _, edges in trips]
 
@@ -134,7 +134,7 @@ def _route(
     edges = list(network.links[source].edges)
     link = source
     while True:
-        position = np.searchsorted(cumulative[link], rng.uniform(), side="right")
+        position = int(np.searchsorted(cumulative[link], rng.uniform(), side="right"))
         turn = network.turns[turns_of[link][min(position, len(turns_of[link]) - 1)]]
         if turn.next_link == EXIT:
             return [*edges, turn.to_edge]

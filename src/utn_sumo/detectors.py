@@ -1,8 +1,8 @@
 """Loops and lane-area detectors of a network, as a SUMO additional file.
 
-Every lane of a link has a loop at its entry and one at its stop line, and a lane-area detector that covers
-the last 200 m before it; every road that leads away has entry loops too, so that turns can be told apart. All report once a
-control step, which is when they are read: interval counts, never sums of steps (FINDINGS 4).
+Every lane of a link has a loop at its entry and one at its stop line, and a lane-area detector on the last 200 m
+before it; every road that leads away has entry loops too, so that turns can be told apart. All report once a control
+step, which is when they are read: interval counts, never sums of steps (SPEC 6).
 """
 
 from __future__ import annotations
@@ -43,8 +43,7 @@ def ids(network: Network) -> DetectorIds:
         entry=tuple(on("entry", link.edges[0]) for link in network.links),
         stop_line=tuple(on("stop", link.edges[-1]) for link in network.links),
         area=tuple(
-            tuple(name for edge, _ in _watched(network, link) for name in on("area", edge))
-            for link in network.links
+            tuple(name for edge, _ in _watched(network, link) for name in on("area", edge)) for link in network.links
         ),
         to_edge=tuple(on("entry", turn.to_edge) for turn in network.turns),
     )

@@ -1,12 +1,12 @@
 """Every error that this package raises on purpose.
 
-    UtnError                    one line for the user: the thing, the value, the remedy; exit code 2
-    ├── SettingError            a setting, a flag, a configuration file
-    ├── NetworkError            a SUMO network, its programmes, its turning fractions
-    ├── ControllerError         a controller that can't be found or built
-    ├── PlantError              SUMO: start, ownership, a run that broke off
-    ├── PlanError               a plan that must not reach the signals
-    └── ResultError             a result folder: there already, missing, unreadable
+UtnError                    one line for the user: the thing, the value, the remedy; exit code 2
+├── SettingError            a setting, a flag, a configuration file
+├── NetworkError            a SUMO network, its programmes, its turning fractions
+├── ControllerError         a controller that can't be found or built
+├── PlantError              SUMO: start, ownership, a run that broke off
+├── PlanError               a plan that must not reach the signals
+└── ResultError             a result folder: there already, missing, unreadable
 """
 
 from __future__ import annotations

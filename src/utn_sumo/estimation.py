@@ -70,7 +70,7 @@ class CountingEstimator:
         return np.minimum(seen.queue_veh + beyond, self._x_veh)
 
     def _by_link(self, by_turn: Floats) -> Floats:
-        return np.bincount(self.network.turn_link, by_turn, minlength=len(self.network.links))
+        return np.asarray(np.bincount(self.network.turn_link, by_turn, minlength=len(self.network.links)), dtype=float)
 
     def _state(self, time_s: float, turned_veh: Floats) -> State:
         return State(

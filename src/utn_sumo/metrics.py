@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree  # only for the files that our own SUMO has just written
+from xml.etree import ElementTree as ET  # only for the files that our own SUMO has just written
 
 import numpy as np
 
@@ -23,19 +23,19 @@ def trip_measures(trips: Path) -> dict[str, Any]:
     spent = delay = travel = 0.0
     vehicles = arrived = stops = 0
     try:
-        for _, trip in ElementTree.iterparse(trips):
+        for _, trip in ET.iterparse(trips):
             if trip.tag != "tripinfo":
                 continue
             vehicles += 1
-            wait_s, road_s = float(trip.get("departDelay")), float(trip.get("duration"))
+            wait_s, road_s = float(trip.attrib["departDelay"]), float(trip.attrib["duration"])
             spent += wait_s + road_s
-            delay += wait_s + float(trip.get("timeLoss"))
-            stops += int(trip.get("waitingCount"))
-            if float(trip.get("arrival")) >= 0:
+            delay += wait_s + float(trip.attrib["timeLoss"])
+            stops += int(trip.attrib["waitingCount"])
+            if float(trip.attrib["arrival"]) >= 0:
                 arrived += 1
                 travel += wait_s + road_s
             trip.clear()
-    except (OSError, ElementTree.ParseError) as error:
+    except (OSError, ET.ParseError) as error:
         raise ResultError(f"trips {str(trips)!r} can't be read ({error})") from error
     return {
         "total_time_spent_veh_h": spent / 3600,
@@ -51,10 +51,10 @@ def trip_measures(trips: Path) -> dict[str, Any]:
 def teleports(statistics: Path) -> int:
     """Vehicles that SUMO teleported, from its statistics output."""
     try:
-        element = ElementTree.parse(statistics).find("teleports")
-    except (OSError, ElementTree.ParseError) as error:
+        element = ET.parse(statistics).find("teleports")
+    except (OSError, ET.ParseError) as error:
         raise ResultError(f"statistics {str(statistics)!r} can't be read ({error})") from error
-    return int(element.get("total")) if element is not None else 0
+    return int(element.attrib["total"]) if element is not None else 0
 
 
 GRIDLOCK_STEPS = 3
@@ -71,9 +71,8 @@ def gridlocked(network: Network, x_veh: Sequence[Floats], left_veh: Sequence[Flo
     if len(x_veh) <= GRIDLOCK_STEPS:
         return False
     x, left, green = (np.asarray(series, dtype=float) for series in (x_veh, left_veh, greens))
-    turn_green = green @ network.serves
-    link_green = np.zeros_like(x)
-    np.maximum.at(link_green, (slice(None), network.turn_link), turn_green)
+    first_turn = np.searchsorted(network.turn_link, np.arange(x.shape[1]))
+    link_green = np.maximum.reduceat(green @ network.serves, first_turn, axis=1)
     full = x >= GRIDLOCK_OCCUPANCY * network.storage_veh
     stuck = left <= GRIDLOCK_DISCHARGE * link_green * network.saturation_flow_veh_s
     still = full[:-1] & full[1:] & stuck[1:]

@@ -154,9 +154,7 @@ class LinkModel:
         """(Z,) vehicles that a link still takes: C - x, the third term of SPEC 2.3 before it is shared out."""
         return self.network.storage_veh - x_veh
 
-    def step(
-        self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any
-    ) -> tuple[ModelState, StepFlows]:
+    def step(self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any) -> tuple[ModelState, StepFlows]:
         """One step of the exact model.
 
         `green_s` (S,) is the green of each stage within the step, `demand_veh` (Z,) what comes from outside,

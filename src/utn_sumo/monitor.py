@@ -13,6 +13,7 @@ from utn_sumo.contract import Junction, Network
 from utn_sumo.errors import ResultError
 
 LETTERS = frozenset("GgyrsuoO")
+GREEN = "Gg"
 
 
 @dataclass
@@ -45,12 +46,7 @@ def watch(network: Network, switches: Path, duration_s: float) -> Verdict:
     verdict = Verdict()
     for junction in network.junctions:
         states = _by_second(shown.get(junction.id, []), int(duration_s))
-        clearance_s = min(network.stages[stage].clearance_s for stage in junction.stages)
-        yellow_s = min(
-            sum(seconds for state, seconds in network.stages[stage].clearance if "y" in state)
-            for stage in junction.stages
-        )
-        _judge(junction, states, yellow_s, clearance_s, verdict)
+        _Guard(network, junction, verdict).judge(states)
     return verdict
 
 
@@ -62,9 +58,7 @@ def read_switches(path: Path) -> dict[str, list[tuple[int, str]]]:
     try:
         for _, element in ElementTree.iterparse(path):
             if element.tag == "tlsState":
-                shown.setdefault(element.get("id"), []).append(
-                    (int(float(element.get("time"))), element.get("state"))
-                )
+                shown.setdefault(element.get("id"), []).append((int(float(element.get("time"))), element.get("state")))
     except (OSError, ElementTree.ParseError) as error:
         raise ResultError(f"signal record {str(path)!r} can't be read ({error})") from error
     return shown
@@ -78,47 +72,58 @@ def _by_second(switches: list[tuple[int, str]], duration_s: int) -> list[str]:
     return states + [""] * (duration_s - len(states))
 
 
-def _judge(junction: Junction, states: list[str], yellow_s: float, clearance_s: float, verdict: Verdict) -> None:
-    signals = range(len(junction.conflicts))
-    foes = [[b for b in signals if junction.conflicts[a][b]] for a in signals]
-    green_since = dict.fromkeys(signals, 0)
-    yellow_since = dict.fromkeys(signals, 0)
-    last_green = dict.fromkeys(signals, -(10**9))
-    previous = ""
-    for second, state in enumerate(states):
-        if state == previous and len(state) == len(signals):
-            if second > 0 and (junction.id, second - 1) in verdict.seconds and _clash(state, foes):
-                verdict.flag(junction.id, second, "conflicting streams are still open")
-            for signal in signals:
-                if state[signal] in "Gg":
-                    last_green[signal] = second
-            continue
-        if len(state) != len(signals) or not LETTERS.issuperset(state):
-            verdict.flag(junction.id, second, f"shows {state!r}")
-            previous = ""
-            continue
-        clash = _clash(state, foes)
-        if clash:
-            verdict.flag(junction.id, second, f"signals {clash[0]} and {clash[1]} conflict and are open together")
-        for signal in signals:
-            was, now = (previous[signal] if previous else "r"), state[signal]
-            if now in "Gg":
-                if was not in "Gg":
-                    green_since[signal] = second
-                    for foe in foes[signal]:
-                        if now == "G" and state[foe] == "r" and second - last_green[foe] - 1 < clearance_s:
-                            verdict.flag(junction.id, second, f"signal {signal} turns green too soon after {foe}")
-                last_green[signal] = second
-            elif was in "Gg":
-                if second - green_since[signal] < junction.min_green_s:
-                    verdict.flag(junction.id, second, f"signal {signal} was green for less than its least")
-                if now == "y":
-                    yellow_since[signal] = second
-                else:
-                    verdict.flag(junction.id, second, f"signal {signal} goes from green to {now!r} without yellow")
-            elif was == "y" and now != "y" and second - yellow_since[signal] < yellow_s:
-                verdict.flag(junction.id, second, f"signal {signal} had too little yellow")
-        previous = state
+class _Guard:
+    """Follows the signals of one junction through the seconds of a run."""
+
+    def __init__(self, network: Network, junction: Junction, verdict: Verdict) -> None:
+        clearances = [network.stages[stage].clearance for stage in junction.stages]
+        self.junction = junction
+        self.verdict = verdict
+        self.clearance_s = min(sum(seconds for _, seconds in clearance) for clearance in clearances)
+        self.yellow_s = min(sum(seconds for state, seconds in clearance if "y" in state) for clearance in clearances)
+        size = len(junction.conflicts)
+        self.foes = [[b for b in range(size) if junction.conflicts[a][b]] for a in range(size)]
+        self.green_since = [0] * size
+        self.yellow_since = [0] * size
+        self.last_green = [-(10**9)] * size
+
+    def judge(self, states: list[str]) -> None:
+        """Look at every second in turn."""
+        dark = "r" * len(self.foes)
+        previous = dark
+        for second, state in enumerate(states):
+            if len(state) != len(self.foes) or not LETTERS.issuperset(state):
+                self.verdict.flag(self.junction.id, second, f"shows {state!r}")
+                previous = dark
+                continue
+            if clash := _clash(state, self.foes):
+                a, b = clash
+                self.verdict.flag(self.junction.id, second, f"signals {a} and {b} conflict and are open together")
+            if state != previous:
+                for signal, (was, now) in enumerate(zip(previous, state, strict=True)):
+                    if reason := self._change(signal, was, now, second, state):
+                        self.verdict.flag(self.junction.id, second, f"signal {signal} {reason}")
+            for signal, letter in enumerate(state):
+                if letter in GREEN:
+                    self.last_green[signal] = second
+            previous = state
+
+    def _change(self, signal: int, was: str, now: str, second: int, state: str) -> str:
+        """What is wrong with one signal's change at this second; empty if nothing is."""
+        if now in GREEN and was not in GREEN:
+            self.green_since[signal] = second
+            for foe in self.foes[signal]:
+                if now == "G" and state[foe] == "r" and second - self.last_green[foe] - 1 < self.clearance_s:
+                    return f"turns green too soon after signal {foe}"
+        elif was in GREEN and now not in GREEN:
+            self.yellow_since[signal] = second
+            if now != "y":
+                return f"goes from green to {now!r} without yellow"
+            if second - self.green_since[signal] < self.junction.min_green_s:
+                return "was green for less than its least"
+        elif was == "y" and now != "y" and second - self.yellow_since[signal] < self.yellow_s:
+            return "had too little yellow"
+        return ""
 
 
 def _clash(state: str, foes: list[list[int]]) -> tuple[int, int] | None:

@@ -46,7 +46,7 @@ def read(path: Path, name: str) -> Network:
         net = sumolib.net.readNet(
             str(path), withPrograms=True, withLatestPrograms=True, withFoes=True, withInternal=False
         )
-    except Exception as error:  # noqa: BLE001 - whatever a foreign file makes sumolib raise
+    except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise NetworkError(
             f"net {str(path)!r} can't be read ({reason}): give a .net.xml written by netconvert"
@@ -199,7 +199,7 @@ def _stages(tls_id: str, program: Any, junction: int, signal_turn: list[int]) ->
     """Cut a programme into stages, each a green phase with the phases up to the next green one."""
     phases = program.getPhases()
     starts = [i for i, phase in enumerate(phases) if _is_green(phase.state)]
-    if len(starts) < 2 or starts[0] != 0:
+    if len(starts) <= 1 or starts[0] != 0:
         raise NetworkError(
             f"junction {tls_id!r}: its programme must open with a green phase and have two or more of them"
         )

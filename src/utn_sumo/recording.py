@@ -1,11 +1,11 @@
 """What a run leaves on disk, readable at any moment: settings first, a line per cycle, the result last.
 
-    settings.json   scenario, versions
-    cycles.jsonl    one object per control step: measurement, state, forecast, plan, who it came from, SUMO's truth
-    trips.xml       SUMO's tripinfo, unfinished and undeparted vehicles included
-    signals.xml     every signal switch
-    routes.rou.xml, net.net.xml   what the run was made from, so that the folder is complete in itself
-    result.json     the measures of SPEC 7
+settings.json   scenario, versions
+cycles.jsonl    one object per control step: measurement, state, forecast, plan, who it came from, SUMO's truth
+trips.xml       SUMO's tripinfo, unfinished and undeparted vehicles included
+signals.xml     every signal switch
+routes.rou.xml, net.net.xml   what the run was made from, so that the folder is complete in itself
+result.json     the measures of SPEC 7
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def new_folder(path: Path | None, default_name: str) -> Path:
         names = [default_name, *(f"{default_name}-{n}" for n in range(2, 10_000))]
         path = next(base / name for name in names if not (base / name).exists())
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise ResultError(f"output folder {str(path)!r} exists and holds results: name another with --out, or remove it")
+        raise ResultError(
+            f"output folder {str(path)!r} exists and holds results: name another with --out, or remove it"
+        )
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -86,8 +88,5 @@ def plain(value: Any) -> Any:
         return np.round(value, 6).tolist()
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return round(value, 6)
-    return value
+    value = value.item() if isinstance(value, np.generic) else value
+    return round(value, 6) if isinstance(value, float) else value

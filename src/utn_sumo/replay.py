@@ -34,7 +34,12 @@ def write(folder: Path) -> Path:
     signals = target / "signals.add.xml"
     _write_programmes(signals, switches, duration_s)
     arguments = run_arguments(
-        Path("../net.net.xml"), Path("../routes.rou.xml"), [Path(signals.name)], Path(), settings["seed"], duration_s
+        Path("../net.net.xml"),
+        Path("../routes.rou.xml"),
+        [Path(signals.name)],
+        Path(),
+        seed=settings["seed"],
+        duration_s=duration_s,
     )
     configuration = target / "run.sumocfg"
     _write_configuration(configuration, arguments)

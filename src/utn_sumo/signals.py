@@ -6,11 +6,11 @@ SUMO shows whatever it is told (FINDINGS 1), so nothing reaches it that this mod
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
-from utn_sumo.contract import Floats, Network, Plan
+from utn_sumo.contract import Floats, Junction, Network, Plan
 from utn_sumo.errors import PlanError
 
 TOLERANCE_S = 1e-3
@@ -32,7 +32,9 @@ def admit(plan: Plan, network: Network) -> Plan:
         stages = list(junction.stages)
         short = green_s[stages].min()
         if short < junction.min_green_s - TOLERANCE_S:
-            raise PlanError(f"junction {junction.id}: green of {short:g} s is under the {junction.min_green_s:g} s least")
+            raise PlanError(
+                f"junction {junction.id}: green of {short:g} s is under the {junction.min_green_s:g} s least"
+            )
         total, budget = green_s[stages].sum(), network.green_budget_s[index]
         if abs(total - budget) > TOLERANCE_S * len(stages):
             raise PlanError(f"junction {junction.id}: greens sum to {total:g} s, its cycle leaves {budget:g} s")
@@ -73,13 +75,16 @@ def check_programme(network: Network, junction: int, phases: list[tuple[str, flo
             raise PlanError(f"junction {item.id}: phase of {duration:g} s, whole seconds from 1 on are needed")
         if len(state) != len(item.signal_turn):
             raise PlanError(f"junction {item.id}: {len(state)} letters for {len(item.signal_turn)} signals")
-        greens = [i for i, letter in enumerate(state) if letter == "G"]
-        for a in greens:
-            for b in greens:
-                if item.conflicts[a][b]:
-                    raise PlanError(f"junction {item.id}: signals {a} and {b} conflict and are both green")
+        _refuse_conflict(item, state)
     states = [state for state, _ in phases]
     for before, after in pairwise([*states, states[0]]):
         for signal, (was, becomes) in enumerate(zip(before, after, strict=True)):
             if was in "Gg" and becomes == "r":
                 raise PlanError(f"junction {item.id}: signal {signal} goes from green to red without yellow")
+
+
+def _refuse_conflict(junction: Junction, state: str) -> None:
+    greens = [signal for signal, letter in enumerate(state) if letter == "G"]
+    for a, b in combinations(greens, 2):
+        if junction.conflicts[a][b]:
+            raise PlanError(f"junction {junction.id}: signals {a} and {b} conflict and are both green")

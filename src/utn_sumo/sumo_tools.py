@@ -19,7 +19,5 @@ def sumo_binary(name: str) -> Path:
                 return candidate
     found = shutil.which(name)
     if found is None:
-        raise PlantError(
-            f"{name!r} isn't installed: run pip install 'utn-sumo[sumo]', which brings SUMO's binaries"
-        )
+        raise PlantError(f"{name!r} isn't installed: run pip install 'utn-sumo[sumo]', which brings SUMO's binaries")
     return Path(found)

@@ -1,9 +1,9 @@
 """Distributed MPC: one agent a junction, coordinated with its neighbours (SPEC 4).
 
-    settings      what a user may set
-    problem       one junction's problem, stated in CasADi
-    agent         its solver, and the copies that it shares
-    coordination  ADMM among the agents
+settings      what a user may set
+problem       one junction's problem, stated in CasADi
+agent         its solver, and the copies that it shares
+coordination  ADMM among the agents
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ class DistributedMPC:
         place = {link: row for row, link in enumerate(fed)}
         self._fed = np.array(fed, dtype=np.int64)
         self.agents = [
-            Agent(JunctionProblem(network, junction, self.settings), place) for junction in range(len(network.junctions))
+            Agent(JunctionProblem(network, junction, self.settings), place)
+            for junction in range(len(network.junctions))
         ]
         self._consensus: Consensus | None = None
 
     def plan(self, state: State, forecast: Forecast) -> Plan:
-        """Coordinated greens for the coming cycle and the control horizon. Raises ControllerError without an optimum."""
+        """Coordinated greens for the coming cycle and the control horizon; ControllerError without an optimum."""
         if self._consensus is None:
             inflow = np.repeat(state.past_inflow_veh[0][self._fed][:, None], self.horizon, axis=1)
             self._consensus = Consensus(inflow, np.zeros_like(inflow), self.settings.rho)

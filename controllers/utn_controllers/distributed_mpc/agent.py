@@ -39,7 +39,8 @@ class Agent:
 
     def prepare(self, state: State, forecast: Forecast, rho: float) -> None:
         """Take up a new state. The Hessian is factorised once for each `rho`; later states only bring vectors
-        and the constraint matrix, and the solver starts from the last active set."""
+        and the constraint matrix, and the solver starts from the last active set.
+        """
         self.program = self.problem.program(state, forecast)
         if self._solver is None or rho != self._rho:
             self.factorise(rho)

@@ -51,18 +51,17 @@ class Layout:
     @classmethod
     def of(cls, part: Network, settings: Settings) -> Layout:
         """The layout for one junction's part of a network."""
-        shapes = [
-            (settings.control_horizon, len(part.stages)),
-            (settings.horizon, len(part.turns)),
-            (settings.horizon, len(part.links)),
-            (settings.horizon, len(part.links)),
-        ]
-        blocks, start = [], 0
-        for shape in shapes:
-            count = shape[0] * shape[1]
-            blocks.append(np.arange(start, start + count).reshape(shape))
-            start += count
-        return cls(*blocks, size=start)
+        steps, links = settings.horizon, len(part.links)
+        start = 0
+
+        def block(rows: int, columns: int) -> npt.NDArray[np.int64]:
+            nonlocal start
+            start += rows * columns
+            return np.arange(start - rows * columns, start).reshape(rows, columns)
+
+        green = block(settings.control_horizon, len(part.stages))
+        leaving, inflow, over = block(steps, len(part.turns)), block(steps, links), block(steps, links)
+        return cls(green, leaving, inflow, over, size=start)
 
 
 class JunctionProblem:
@@ -139,82 +138,100 @@ class JunctionProblem:
         self._results = [np.zeros(shape, order="F") if shape[1] > 1 else np.zeros(shape[0]) for shape in shapes]
         self._function = function
         self._buffer, self._run = function.buffer()
-        self._buffer.set_arg(0, memoryview(self._parameters))
+        self._buffer.set_arg(0, memoryview(self._parameters.data))
         for position, array in enumerate(self._results):
-            self._buffer.set_res(position, memoryview(array.T if array.ndim == 2 else array))
+            self._buffer.set_res(position, memoryview(array.T.data))
 
     def _state_problem(self) -> Any:
         """CasADi function: parameters -> Hessian, gradient, constraint matrix, bounds, constant."""
         import casadi as ca  # noqa: PLC0415 - heavy
 
-        settings, part, model = self.settings, self.part, self.model
-        links, turns = len(part.links), len(part.turns)
-        z = ca.SX.sym("z", self.layout.size)
+        size = self.layout.size
+        z = ca.SX.sym("z", size)
+        parameters = self._symbols()
+        cost, rows = self._predict(z, **parameters)
+        expressions = ca.vertcat(*[row[0] for row in rows])
+        lower, upper = (
+            ca.vertcat(*[ca.repmat(ca.DM(row[side]), row[0].numel(), 1) for row in rows]) for side in (1, 2)
+        )
+        hessian, gradient = ca.hessian(cost, z)
+        at_zero = ca.substitute(ca.vertcat(gradient, expressions, cost), z, ca.DM.zeros(size))
+        offset = at_zero[size:-1]
+        box = self._simple_bounds()
+        outputs = [
+            hessian,
+            at_zero[:size],
+            ca.jacobian(expressions, z),
+            ca.vertcat(box[0], lower - offset),
+            ca.vertcat(box[1], upper - offset),
+            at_zero[-1],
+        ]
+        flat = [ca.vertcat(*item) if isinstance(item, list) else item for item in parameters.values()]
+        return ca.Function("problem", [ca.vertcat(*flat)], [ca.densify(ca.SX(item)) for item in outputs])
 
-        def parameter(name: str, *shape: int) -> Any:
-            symbol = ca.SX.sym(name, int(np.prod(shape)))
-            parameters.append(symbol)
-            return symbol if len(shape) == 1 else ca.vertsplit(symbol, shape[1])
+    def _symbols(self) -> dict[str, Any]:
+        """The problem's parameters, in the order in which `program` fills them in; lists run over steps or lags."""
+        import casadi as ca  # noqa: PLC0415 - heavy
 
-        parameters: list[Any] = []
-        x = parameter("x", links)
-        q = parameter("q", turns)
-        waiting = parameter("w", links)
-        past = parameter("past", self._lags, links)
-        demand = parameter("demand", settings.horizon, links)
-        share = parameter("share", self._lags, links)
-        fraction = parameter("fraction", turns)
+        links, turns = len(self.part.links), len(self.part.turns)
 
-        source = part.is_source.astype(float)
-        serves = part.serves.T.astype(float)
+        def over(name: str, count: int) -> list[Any]:
+            return [ca.SX.sym(f"{name}{index}", links) for index in range(count)]
+
+        return {
+            "x": ca.SX.sym("x", links),
+            "q": ca.SX.sym("q", turns),
+            "waiting": ca.SX.sym("waiting", links),
+            "past": over("past", self._lags),
+            "demand": over("demand", self.settings.horizon),
+            "share": over("share", self._lags),
+            "fraction": ca.SX.sym("fraction", turns),
+        }
+
+    def _predict(
+        self,
+        z: Any,
+        *,
+        x: Any,
+        q: Any,
+        waiting: Any,
+        past: list[Any],
+        demand: list[Any],
+        share: list[Any],
+        fraction: Any,
+    ) -> tuple[Any, list[tuple[Any, float, float]]]:
+        """The horizon: (cost, rows), a row being (expression, lower, upper)."""
+        import casadi as ca  # noqa: PLC0415 - heavy
+
+        settings, part, model, layout = self.settings, self.part, self.model, self.layout
+        by_link = model.operations.matmul
+        serves, source = part.serves.T.astype(float), part.is_source.astype(float)
+        budget_s = float(part.green_budget_s[0])
         cost: Any = 0
-        rows: list[tuple[Any, Any, Any]] = []
-        budget = float(part.green_budget_s[0])
-        for step in range(settings.control_horizon):
-            rows.append((ca.sum1(z[self.layout.green[step]]), budget, budget))
+        rows = [(ca.sum1(z[green]), budget_s, budget_s) for green in layout.green]
         for step in range(settings.horizon):
-            green = z[self.layout.green[min(step, settings.control_horizon - 1)]]
-            leaving = z[self.layout.leaving[step]]
-            inflow = z[self.layout.inflow[step]]
-            over = z[self.layout.over_storage[step]]
-            moving = x - model.operations.matmul(model.leaves, q)
+            green = z[layout.green[min(step, settings.control_horizon - 1)]]
+            leaving, inflow, over = z[layout.leaving[step]], z[layout.inflow[step]], z[layout.over_storage[step]]
+            moving = x - by_link(model.leaves, q)
             arriving = model.arriving_veh(moving, inflow, past, share)
-            unsaturated = q + fraction * model.operations.matmul(model.leaves.T, arriving)
-            turn_green = model.operations.matmul(serves, green)
-            rows.append((leaving - unsaturated, -np.inf, 0))
-            rows.append((leaving - model.saturated_veh(turn_green, fraction), -np.inf, 0))
-            rows.append((inflow - over - model.room_veh(x), -np.inf, 0))
+            unsaturated = q + fraction * by_link(model.leaves.T, arriving)
+            saturated = model.saturated_veh(by_link(serves, green), fraction)
+            # The three terms of SPEC 2.3, the third as the consumer's: it knows its storage.
+            rows += [
+                (leaving - unsaturated, -np.inf, 0.0),
+                (leaving - saturated, -np.inf, 0.0),
+                (inflow - over - model.room_veh(x), -np.inf, 0.0),
+            ]
             q = unsaturated - leaving
-            x = x + inflow - model.operations.matmul(model.leaves, leaving)
+            x = x + inflow - by_link(model.leaves, leaving)
             waiting = waiting + source * (demand[step] - inflow)
-            for link in np.flatnonzero(part.is_source):
-                rows.append((waiting[int(link)], 0, np.inf))
+            rows += [(waiting[int(link)], 0.0, np.inf) for link in np.flatnonzero(part.is_source)]
             past = [inflow, *past[:-1]]
             cost += settings.stage_cost(x, waiting, part) + STORAGE_PENALTY * ca.sum1(over)
             cost += REGULARISATION / 2 * (ca.sumsqr(leaving) + ca.sumsqr(inflow) + ca.sumsqr(over))
             if step < settings.control_horizon:
                 cost += settings.green_cost(green)
-        expressions = ca.vertcat(*[row[0] for row in rows])
-        lower = ca.vertcat(*[ca.repmat(ca.DM(row[1]), row[0].numel(), 1) for row in rows])
-        upper = ca.vertcat(*[ca.repmat(ca.DM(row[2]), row[0].numel(), 1) for row in rows])
-
-        hessian, gradient = ca.hessian(cost, z)
-        matrix = ca.jacobian(expressions, z)
-        at_zero = ca.substitute(
-            ca.vertcat(gradient, expressions, cost), z, ca.DM.zeros(self.layout.size)
-        )
-        size = self.layout.size
-        offset = at_zero[size : size + expressions.numel()]
-        bounds = self._simple_bounds()
-        outputs = [
-            hessian,
-            at_zero[:size],
-            matrix,
-            ca.vertcat(bounds[0], lower - offset),
-            ca.vertcat(bounds[1], upper - offset),
-            at_zero[-1],
-        ]
-        return ca.Function("problem", [ca.vertcat(*parameters)], [ca.densify(ca.SX(item)) for item in outputs])
+        return cost, rows
 
     def _simple_bounds(self) -> tuple[Floats, Floats]:
         lower, upper = np.zeros(self.layout.size), np.full(self.layout.size, np.inf)

@@ -25,9 +25,9 @@ class Settings(BaseModel):
     """R of the paper's cost: weight of g^2 (g in s)."""
     crowding: float = Field(1.0, ge=0)
     """Weight of x^2 / storage beside the time spent in the `tts` cost: what keeps room on the links."""
-    iterations: int = Field(10, ge=1, le=1000)
+    iterations: int = Field(20, ge=1, le=1000)
     """Most ADMM iterations in a control step."""
-    rho: float = Field(0.1, gt=0)
+    rho: float = Field(0.2, gt=0)
     """First ADMM penalty."""
     relaxation: float = Field(1.6, gt=0, lt=2)
     tolerance_abs: float = Field(1e-2, gt=0)

@@ -75,15 +75,13 @@ class SumoPlant:
         detectors.write(self.network, additional[0], self.network.control_step_s)
         write_outputs(additional[1])
         arguments = run_arguments(
-            self.network.net_file, self.routes, additional, self.folder, self.seed, self.duration_s
+            self.network.net_file, self.routes, additional, self.folder, seed=self.seed, duration_s=self.duration_s
         )
         started = time.perf_counter()
         try:
             libsumo.start(["sumo", *arguments])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-            raise PlantError(
-                f"SUMO did not start ({_first_line(error)}): see {self.folder / 'sumo.log'}"
-            ) from error
+            raise PlantError(f"SUMO did not start ({_first_line(error)}): see {self.folder / 'sumo.log'}") from error
         self.sumo_time_s = time.perf_counter() - started
         SumoPlant._owner = self
         self._sumo = libsumo
@@ -128,12 +126,8 @@ class SumoPlant:
                 waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
                 present = self._sumo.vehicle.getIDCount() + waiting.sum()
                 spent_veh_s += present * (self.time_s - before_s)
-                np.maximum(
-                    peak_queue, self._by_edge(self._sumo.edge.getLastStepHaltingNumber), out=peak_queue
-                )
-            self.truth = Truth(
-                x_veh, waiting, peak_x, peak_queue, self._sumo.vehicle.getIDCount(), spent_veh_s / 3600
-            )
+                np.maximum(peak_queue, self._by_edge(self._sumo.edge.getLastStepHaltingNumber), out=peak_queue)
+            self.truth = Truth(x_veh, waiting, peak_x, peak_queue, self._sumo.vehicle.getIDCount(), spent_veh_s / 3600)
             return self._measure()
         except (self._sumo.TraCIException, self._sumo.FatalTraCIError) as error:
             raise PlantError(f"SUMO broke off at {self.time_s:g} s ({_first_line(error)})") from error
@@ -184,7 +178,7 @@ def write_outputs(path: Path) -> None:
 
 
 def run_arguments(
-    net_file: Path, routes: Path, additional: Sequence[Path], folder: Path, seed: int, duration_s: float
+    net_file: Path, routes: Path, additional: Sequence[Path], folder: Path, *, seed: int, duration_s: float
 ) -> list[str]:
     """Options of a run, the same for libsumo and for the bare `sumo` binary, which makes replays equal."""
     return [

@@ -1,0 +1,218 @@
+"""The project's own benchmarks: every figure that the README quotes is printed by one of these.
+
+    python tools/bench.py overhead     control and bridge against the bare `sumo` binary on the same signals
+    python tools/bench.py gap          the agents' plans against the same problem solved whole
+    python tools/bench.py traffic      controllers against each other over demands and seeds
+
+Each prints a table, or with --json one object (traffic: a list of objects).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+
+@click.group()
+def bench() -> None:
+    """Benchmarks of utn-sumo."""
+
+
+@bench.command()
+@click.option("--net", default="utn17", show_default=True)
+@click.option("--hours", default=4.0, show_default=True)
+@click.option("--demand", default=1.0, show_default=True)
+@click.option("--seed", default=1, show_default=True)
+@click.option("--repeats", default=3, show_default=True)
+@click.option("--json", "as_json", is_flag=True)
+def overhead(net: str, hours: float, demand: float, seed: int, repeats: int, as_json: bool) -> None:
+    """What control and bridge cost, as a share of the bare `sumo` binary's wall time on the same signals."""
+    from utn_sumo import bridge, replay, sumo_tools
+    from utn_sumo.scenario import scenario
+
+    rows = []
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary) / "run"
+            result = bridge.run(scenario(net=net, hours=hours, demand=demand, seed=seed), folder)
+            configuration = replay.write(folder)
+            started = time.perf_counter()
+            subprocess.run([sumo_tools.sumo_binary("sumo"), "-c", configuration.name], cwd=configuration.parent, check=True)
+            bare_s = time.perf_counter() - started
+        rows.append(
+            {
+                "bare_sumo_s": bare_s,
+                "sumo_time_s": result["sumo_time_s"],
+                "control_time_s": result["control_time_s"],
+                "bridge_time_s": result["bridge_time_s"],
+                "control_over_sumo": result["control_time_s"] / result["sumo_time_s"],
+                "overhead": (result["control_time_s"] + result["bridge_time_s"]) / bare_s,
+            }
+        )
+    summary = {key: statistics.median(row[key] for row in rows) for key in rows[0]}
+    if as_json:
+        click.echo(json.dumps({**summary, "repeats": rows}))
+        return
+    _show(
+        f"dmpc, {net}, {hours:g} h, demand {demand:g}, seed {seed}: median of {repeats}",
+        ["figure", "median", "min", "max"],
+        [
+            [key, *(f"{value:.3f}" for value in (summary[key], min(r[key] for r in rows), max(r[key] for r in rows)))]
+            for key in summary
+        ],
+    )
+
+
+@bench.command()
+@click.option("--net", default="utn17", show_default=True)
+@click.option("--hours", default=2.0, show_default=True)
+@click.option("--demand", default=1.3, show_default=True)
+@click.option("--seed", default=1, show_default=True)
+@click.option("--every", default=3, show_default=True, help="Judge every n-th control step.")
+@click.option("--json", "as_json", is_flag=True)
+def gap(net: str, hours: float, demand: float, seed: int, every: int, as_json: bool) -> None:
+    """Cost of the agents' plans over the least cost of the same problem solved whole, along a run in closed loop.
+
+    A plan's cost is that of its greens under the best flows that they allow; the states are those that the
+    default controller met in SUMO, and every setting below sees the same ones, warm from one to the next.
+    """
+    from utn_sumo import bridge, network, recording
+    from utn_sumo.scenario import scenario
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "run"
+        bridge.run(scenario(net=net, hours=hours, demand=demand, seed=seed), folder)
+        lines = (folder / recording.CYCLES).read_text(encoding="utf-8").splitlines()
+    states = [_state(json.loads(line)) for line in lines]
+    rows = [
+        _gap_of(network.load(net), states, every, settings)
+        for cost in ("tts", "paper")
+        for settings in ({"cost": cost, "iterations": cap} for cap in (1, 5, 10, 20, 40, 80))
+    ]
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    _show(
+        f"{net}, demand {demand:g}, seed {seed}: gap to the whole problem's optimum over {rows[0]['steps']} steps",
+        ["cost", "iterations at most", "used", "mean gap %", "median gap %", "worst gap %"],
+        [
+            [r["cost"], str(r["cap"]), f"{r['iterations']:.1f}"]
+            + [f"{100 * r[key]:.4f}" for key in ("gap_mean", "gap_median", "gap_max")]
+            for r in rows
+        ],
+    )
+
+
+def _state(record: dict[str, Any]) -> tuple[Any, Any]:
+    from utn_sumo.contract import Forecast, State
+
+    state = {key: np.array(value) if isinstance(value, list) else value for key, value in record["state"].items()}
+    return State(**state), Forecast(np.array(record["forecast"]["demand_veh"]))
+
+
+def _gap_of(net: Any, states: list[tuple[Any, Any]], every: int, settings: dict[str, Any]) -> dict[str, Any]:
+    from utn_controllers.distributed_mpc import DistributedMPC
+    from utn_controllers.distributed_mpc.whole import optimum
+
+    controller = DistributedMPC(net, **settings)
+    problems = [agent.problem for agent in controller.agents]
+    gaps, iterations = [], []
+    for step, (state, forecast) in enumerate(states):
+        plan = controller.plan(state, forecast)
+        iterations.append(plan.facts["iterations"])
+        if step % every == 0:
+            greens = np.vstack([plan.green_s, plan.ahead_s])
+            least, _ = optimum(problems, state, forecast)
+            reached, _ = optimum(problems, state, forecast, greens)
+            gaps.append(reached / least - 1)
+    return {
+        "cost": settings["cost"],
+        "cap": settings["iterations"],
+        "iterations": statistics.mean(iterations),
+        "steps": len(gaps),
+        "gap_mean": statistics.mean(gaps),
+        "gap_median": statistics.median(gaps),
+        "gap_max": max(gaps),
+    }
+
+
+@bench.command()
+@click.option("--net", default="utn17", show_default=True)
+@click.option("--hours", default=2.0, show_default=True)
+@click.option("--controllers", default="dmpc,fixed", show_default=True)
+@click.option("--demands", default="1.3", show_default=True)
+@click.option("--seeds", default="1,2,3,4,5", show_default=True)
+@click.option("--json", "as_json", is_flag=True)
+def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, as_json: bool) -> None:
+    """Controllers over demands and seeds, in parallel processes; the first one's time spent over the others'."""
+    names = controllers.split(",")
+    jobs = [
+        {"net": net, "hours": hours, "controller": name, "demand": float(demand), "seed": int(seed)}
+        for demand in demands.split(",")
+        for name in names
+        for seed in seeds.split(",")
+    ]
+    with ProcessPoolExecutor(os.cpu_count(), max_tasks_per_child=1) as pool:
+        results = list(pool.map(_traffic_job, jobs))
+    if as_json:
+        click.echo(json.dumps(results))
+        return
+    rows = []
+    for demand in sorted({job["demand"] for job in jobs}):
+        first: dict[int, float] = {}
+        for name in names:
+            runs = [r for r in results if r["controller"] == name and r["demand"] == demand]
+            spent = {r["seed"]: r["total_time_spent_veh_h"] for r in runs}
+            first = first or spent
+            ratios = [first[seed] / spent[seed] for seed in spent]
+            rows.append(
+                [
+                    f"{demand:g}",
+                    name,
+                    " ".join(f"{value:.0f}" for value in spent.values()),
+                    f"{statistics.median(spent.values()):.0f}",
+                    f"{statistics.median(first.values()) / statistics.median(spent.values()):.3f}",
+                    f"{min(ratios):.3f}-{max(ratios):.3f}",
+                    str(sum(r["gridlock"] for r in runs)),
+                    str(sum(r["unsafe_signal_s"] + r["fallbacks"] + r["teleports"] for r in runs)),
+                ]
+            )
+    _show(
+        f"{net}, {hours:g} h, seeds {seeds}: total time spent [veh h], and {names[0]}'s over each one's",
+        ["demand", "controller", "by seed", "median", "ratio of medians", "by seed", "gridlocked", "unsafe, fallback, teleport"],
+        rows,
+    )
+
+
+def _traffic_job(job: dict[str, Any]) -> dict[str, Any]:
+    from utn_sumo import bridge
+    from utn_sumo.scenario import scenario
+
+    with tempfile.TemporaryDirectory() as temporary:
+        return bridge.run(scenario(**job), Path(temporary) / "run")
+
+
+def _show(title: str, heads: list[str], rows: list[list[str]]) -> None:
+    table = Table(title=title, title_justify="left")
+    for position, head in enumerate(heads):
+        table.add_column(head, justify="left" if position == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=None if sys.stdout.isatty() else 140).print(table)
+
+
+if __name__ == "__main__":
+    bench()
