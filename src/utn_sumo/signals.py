@@ -1,6 +1,6 @@
 """Plan to signal programme: whole seconds, clearances, and a last check that refuses with a reason.
 
-SUMO shows whatever it is told (FINDINGS 1), so nothing reaches it that this module has not admitted.
+SUMO shows whatever it is told, all-green and NaN included, so nothing reaches it that this module has not admitted.
 """
 
 from __future__ import annotations
