@@ -25,6 +25,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from utn_controllers.distributed_mpc import DistributedMPC
+from utn_controllers.distributed_mpc.whole import optimum
+from utn_sumo import bridge, network, recording, replay, sumo_tools
+from utn_sumo.contract import Forecast, Network, State
+from utn_sumo.scenario import scenario
+
 
 @click.group()
 def bench() -> None:
@@ -40,17 +46,17 @@ def bench() -> None:
 @click.option("--json", "as_json", is_flag=True)
 def overhead(net: str, hours: float, demand: float, seed: int, repeats: int, as_json: bool) -> None:
     """What control and bridge cost, as a share of the bare `sumo` binary's wall time on the same signals."""
-    from utn_sumo import bridge, replay, sumo_tools
-    from utn_sumo.scenario import scenario
-
     rows = []
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary) / "run"
+            started = time.perf_counter()
             result = bridge.run(scenario(net=net, hours=hours, demand=demand, seed=seed), folder)
+            run_s = time.perf_counter() - started
             configuration = replay.write(folder)
             started = time.perf_counter()
-            subprocess.run([sumo_tools.sumo_binary("sumo"), "-c", configuration.name], cwd=configuration.parent, check=True)
+            sumo = sumo_tools.sumo_binary("sumo")
+            subprocess.run([sumo, "-c", configuration.name], cwd=configuration.parent, check=True)
             bare_s = time.perf_counter() - started
         rows.append(
             {
@@ -59,6 +65,7 @@ def overhead(net: str, hours: float, demand: float, seed: int, repeats: int, as_
                 "control_time_s": result["control_time_s"],
                 "bridge_time_s": result["bridge_time_s"],
                 "control_over_sumo": result["control_time_s"] / result["sumo_time_s"],
+                "run_over_bare": run_s / bare_s,
                 "overhead": (result["control_time_s"] + result["bridge_time_s"]) / bare_s,
             }
         )
@@ -89,9 +96,6 @@ def gap(net: str, hours: float, demand: float, seed: int, every: int, as_json: b
     A plan's cost is that of its greens under the best flows that they allow; the states are those that the
     default controller met in SUMO, and every setting below sees the same ones, warm from one to the next.
     """
-    from utn_sumo import bridge, network, recording
-    from utn_sumo.scenario import scenario
-
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "run"
         bridge.run(scenario(net=net, hours=hours, demand=demand, seed=seed), folder)
@@ -116,16 +120,13 @@ def gap(net: str, hours: float, demand: float, seed: int, every: int, as_json: b
     )
 
 
-def _state(record: dict[str, Any]) -> tuple[Any, Any]:
-    from utn_sumo.contract import Forecast, State
+def _state(record: dict[str, Any]) -> tuple[State, Forecast]:
 
     state = {key: np.array(value) if isinstance(value, list) else value for key, value in record["state"].items()}
     return State(**state), Forecast(np.array(record["forecast"]["demand_veh"]))
 
 
-def _gap_of(net: Any, states: list[tuple[Any, Any]], every: int, settings: dict[str, Any]) -> dict[str, Any]:
-    from utn_controllers.distributed_mpc import DistributedMPC
-    from utn_controllers.distributed_mpc.whole import optimum
+def _gap_of(net: Network, states: list[tuple[State, Forecast]], every: int, settings: dict[str, Any]) -> dict[str, Any]:
 
     controller = DistributedMPC(net, **settings)
     problems = [agent.problem for agent in controller.agents]
@@ -178,6 +179,7 @@ def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, 
             spent = {r["seed"]: r["total_time_spent_veh_h"] for r in runs}
             first = first or spent
             ratios = [first[seed] / spent[seed] for seed in spent]
+            alarms = sum(r["unsafe_signal_s"] + r["fallbacks"] + r["teleports"] for r in runs)
             rows.append(
                 [
                     f"{demand:g}",
@@ -187,19 +189,17 @@ def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, 
                     f"{statistics.median(first.values()) / statistics.median(spent.values()):.3f}",
                     f"{min(ratios):.3f}-{max(ratios):.3f}",
                     str(sum(r["gridlock"] for r in runs)),
-                    str(sum(r["unsafe_signal_s"] + r["fallbacks"] + r["teleports"] for r in runs)),
+                    str(alarms),
                 ]
             )
     _show(
-        f"{net}, {hours:g} h, seeds {seeds}: total time spent [veh h], and {names[0]}'s over each one's",
-        ["demand", "controller", "by seed", "median", "ratio of medians", "by seed", "gridlocked", "unsafe, fallback, teleport"],
+        f"{net}, {hours:g} h, seeds {seeds}: time spent (veh h), {names[0]}'s over each one's, alarms (unsafe s, fallbacks, teleports)",
+        ["demand", "controller", "by seed", "median", "ratio of medians", "by seed", "gridlocked", "alarms"],
         rows,
     )
 
 
 def _traffic_job(job: dict[str, Any]) -> dict[str, Any]:
-    from utn_sumo import bridge
-    from utn_sumo.scenario import scenario
 
     with tempfile.TemporaryDirectory() as temporary:
         return bridge.run(scenario(**job), Path(temporary) / "run")

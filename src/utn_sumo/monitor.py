@@ -7,6 +7,7 @@ part of a signal cabinet that would switch to flashing yellow.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 from utn_sumo.contract import Junction, Network
@@ -45,8 +46,7 @@ def watch(network: Network, switches: Path, duration_s: float) -> Verdict:
     shown = read_switches(switches)
     verdict = Verdict()
     for junction in network.junctions:
-        states = _by_second(shown.get(junction.id, []), int(duration_s))
-        _Guard(network, junction, verdict).judge(states)
+        _Guard(network, junction, verdict).judge(_stretches(shown.get(junction.id, []), int(duration_s)))
     return verdict
 
 
@@ -64,12 +64,10 @@ def read_switches(path: Path) -> dict[str, list[tuple[int, str]]]:
     return shown
 
 
-def _by_second(switches: list[tuple[int, str]], duration_s: int) -> list[str]:
-    states: list[str] = []
-    for position, (start, state) in enumerate(switches):
-        end = switches[position + 1][0] if position + 1 < len(switches) else duration_s
-        states += [""] * (start - len(states)) + [state] * (min(end, duration_s) - start)
-    return states + [""] * (duration_s - len(states))
+def _stretches(switches: list[tuple[int, str]], duration_s: int) -> list[tuple[str, range]]:
+    """(letters, seconds in which they were shown), without a gap from 0 to the end; "" where nothing was shown."""
+    starts = [(0, ""), *switches, (duration_s, "")]
+    return [(state, range(start, min(end, duration_s))) for (start, state), (end, _) in pairwise(starts) if end > start]
 
 
 class _Guard:
@@ -87,26 +85,28 @@ class _Guard:
         self.yellow_since = [0] * size
         self.last_green = [-(10**9)] * size
 
-    def judge(self, states: list[str]) -> None:
-        """Look at every second in turn."""
+    def judge(self, stretches: list[tuple[str, range]]) -> None:
+        """Look at every second in turn; signals change only where a stretch begins."""
         dark = "r" * len(self.foes)
         previous = dark
-        for second, state in enumerate(states):
+        for state, seconds in stretches:
             if len(state) != len(self.foes) or not LETTERS.issuperset(state):
-                self.verdict.flag(self.junction.id, second, f"shows {state!r}")
+                self._flag_all(seconds, f"shows {state!r}")
                 previous = dark
                 continue
             if clash := _clash(state, self.foes):
-                a, b = clash
-                self.verdict.flag(self.junction.id, second, f"signals {a} and {b} conflict and are open together")
-            if state != previous:
-                for signal, (was, now) in enumerate(zip(previous, state, strict=True)):
-                    if reason := self._change(signal, was, now, second, state):
-                        self.verdict.flag(self.junction.id, second, f"signal {signal} {reason}")
+                self._flag_all(seconds, "signals {} and {} conflict and are open together".format(*clash))
+            for signal, (was, now) in enumerate(zip(previous, state, strict=True)):
+                if reason := self._change(signal, was, now, seconds.start, state):
+                    self.verdict.flag(self.junction.id, seconds.start, f"signal {signal} {reason}")
             for signal, letter in enumerate(state):
                 if letter in GREEN:
-                    self.last_green[signal] = second
+                    self.last_green[signal] = seconds[-1]
             previous = state
+
+    def _flag_all(self, seconds: range, reason: str) -> None:
+        for second in seconds:
+            self.verdict.flag(self.junction.id, second, reason)
 
     def _change(self, signal: int, was: str, now: str, second: int, state: str) -> str:
         """What is wrong with one signal's change at this second; empty if nothing is."""

@@ -10,6 +10,8 @@ from utn_controllers.distributed_mpc.problem import JunctionProblem, QuadraticPr
 from utn_sumo.contract import Floats, Forecast, State
 from utn_sumo.errors import ControllerError
 
+PRODUCER, CONSUMER = 0, 1
+"""The two sides of an interaction."""
 EQUALITY = 5
 """DAQP's code for an equality row."""
 OPTIMAL = (1, 2)
@@ -26,7 +28,9 @@ class Agent:
         consumed, produced = problem.consumed(), problem.produced()
         self.interactions = np.array([place[link] for link in consumed + produced], dtype=np.int64)
         """(n,) rows of the interactions, consumed ones first."""
-        self.sign = np.array([-1.0] * len(consumed) + [1.0] * len(produced))
+        self.side = np.array([CONSUMER] * len(consumed) + [PRODUCER] * len(produced), dtype=np.int64)
+        """(n,) which side of each interaction this agent is."""
+        self.sign = np.where(self.side == PRODUCER, 1.0, -1.0)
         """(n,) sign of the multiplier in the agent's cost: +1 as producer, -1 as consumer."""
         blocks = [problem.inflow_rows(link) for link in consumed] + [problem.outflow_rows(link) for link in produced]
         self._coupling = np.vstack(blocks) if blocks else np.zeros((0, problem.layout.size))

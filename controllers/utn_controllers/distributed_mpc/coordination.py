@@ -62,23 +62,19 @@ def admm(agents: list[Agent], consensus: Consensus, settings: Settings) -> Outco
     converged = False
     iteration = 0
     for iteration in range(1, settings.iterations + 1):  # noqa: B007 - used after the loop
-        flow = {1.0: np.zeros(shape), -1.0: np.zeros(shape)}
+        flow = np.zeros((2, *shape))
         for agent in agents:
             rows = agent.interactions
-            copies = agent.solve(consensus.mean[rows], consensus.price[rows])
-            for row, sign, copy in zip(rows, agent.sign, copies, strict=True):
-                flow[float(sign)][row] = copy
-        produced, consumed = (
-            settings.relaxation * flow[sign] + (1 - settings.relaxation) * consensus.mean for sign in (1.0, -1.0)
-        )
+            flow[agent.side, rows] = agent.solve(consensus.mean[rows], consensus.price[rows])
+        produced, consumed = settings.relaxation * flow + (1 - settings.relaxation) * consensus.mean
         before = consensus.mean
         consensus.mean = (produced + consumed) / 2
         consensus.price = consensus.price + consensus.rho * (produced - consensus.mean)
 
-        primal = float(np.sqrt(sum(np.sum((copy - consensus.mean) ** 2) for copy in flow.values())))
+        primal = float(np.sqrt(np.sum((flow - consensus.mean) ** 2)))
         dual = float(consensus.rho * np.sqrt(2 * np.sum((consensus.mean - before) ** 2)))
         scale = np.sqrt(2 * numbers) * settings.tolerance_abs
-        sizes = max(np.sqrt(sum(np.sum(copy**2) for copy in flow.values())), np.sqrt(2 * np.sum(consensus.mean**2)))
+        sizes = max(np.sqrt(np.sum(flow**2)), np.sqrt(2 * np.sum(consensus.mean**2)))
         prices = np.sqrt(2 * np.sum(consensus.price**2))
         converged = bool(
             primal <= scale + settings.tolerance_rel * sizes
