@@ -121,9 +121,10 @@ def gap(net: str, hours: float, demand: float, seed: int, every: int, as_json: b
 
 
 def _state(record: dict[str, Any]) -> tuple[State, Forecast]:
-
-    state = {key: np.array(value) if isinstance(value, list) else value for key, value in record["state"].items()}
-    return State(**state), Forecast(np.array(record["forecast"]["demand_veh"]))
+    values: dict[str, Any] = {
+        key: np.array(value) if isinstance(value, list) else value for key, value in record["state"].items()
+    }
+    return State(**values), Forecast(np.array(record["forecast"]["demand_veh"]))
 
 
 def _gap_of(net: Network, states: list[tuple[State, Forecast]], every: int, settings: dict[str, Any]) -> dict[str, Any]:
@@ -135,7 +136,7 @@ def _gap_of(net: Network, states: list[tuple[State, Forecast]], every: int, sett
         plan = controller.plan(state, forecast)
         iterations.append(plan.facts["iterations"])
         if step % every == 0:
-            greens = np.vstack([plan.green_s, plan.ahead_s])
+            greens = np.vstack([plan.green_s, np.asarray(plan.ahead_s)])
             least, _ = optimum(problems, state, forecast)
             reached, _ = optimum(problems, state, forecast, greens)
             gaps.append(reached / least - 1)
@@ -160,7 +161,7 @@ def _gap_of(net: Network, states: list[tuple[State, Forecast]], every: int, sett
 def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, as_json: bool) -> None:
     """Controllers over demands and seeds, in parallel processes; the first one's time spent over the others'."""
     names = controllers.split(",")
-    jobs = [
+    jobs: list[dict[str, Any]] = [
         {"net": net, "hours": hours, "controller": name, "demand": float(demand), "seed": int(seed)}
         for demand in demands.split(",")
         for name in names
@@ -193,7 +194,7 @@ def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, 
                 ]
             )
     _show(
-        f"{net}, {hours:g} h, seeds {seeds}: time spent (veh h), {names[0]}'s over each one's, alarms (unsafe s, fallbacks, teleports)",
+        f"{net}, {hours:g} h, seeds {seeds}: time spent (veh h); alarms: unsafe s, fallbacks, teleports",
         ["demand", "controller", "by seed", "median", "ratio of medians", "by seed", "gridlocked", "alarms"],
         rows,
     )
