@@ -128,8 +128,10 @@ def main(arguments: list[str] | None = None) -> None:
         cli.main(args=arguments, prog_name="utn", standalone_mode=False)
     except UtnError as error:
         _fail(str(error))
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
     except click.UsageError as error:
-        _fail(f"{' '.join(error.format_message().split())}: see utn --help")
+        _fail(f"{error.format_message().rstrip('.')}: see utn --help")
     except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("utn: stopped; what was reached is on disk", err=True)
         sys.exit(130)

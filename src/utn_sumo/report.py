@@ -36,7 +36,9 @@ ROWS = [
 
 @contextmanager
 def progress(scenario: Scenario) -> Iterator[Callable[[RunProgress], None]]:
-    """A progress bar with time to go, time spent so far and the present queue."""
+    """A progress bar with time to go, time spent so far and the present queue; it shows up with the first cycle,
+    so that an error before it stays the only line.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -44,14 +46,19 @@ def progress(scenario: Scenario) -> Iterator[Callable[[RunProgress], None]]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[state]}"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(f"{scenario.controller} on {scenario.net}", total=scenario.duration_s, state="")
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task(f"{scenario.controller} on {scenario.net}", total=scenario.duration_s, state="")
 
-        def show(now: RunProgress) -> None:
-            state = f"TTS {now.time_spent_veh_h:.0f} veh h, queue {now.queue_veh:.0f} veh"
-            bar.update(task, completed=now.time_s, state=state)
+    def show(now: RunProgress) -> None:
+        bar.start()
+        state = f"TTS {now.time_spent_veh_h:.0f} veh h, queue {now.queue_veh:.0f} veh"
+        bar.update(task, completed=now.time_s, state=state)
 
+    try:
         yield show
+    finally:
+        if bar.live.is_started:
+            bar.stop()
 
 
 def table(result: dict[str, Any]) -> None:

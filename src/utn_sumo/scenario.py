@@ -60,5 +60,7 @@ def explain(error: ValidationError, known: Iterable[str]) -> str:
     name = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         return f"setting {name!r} is unknown: {did_you_mean(name, known)}"
+    if not name:
+        return first["msg"].removeprefix("Value error, ")
     remedy = first["msg"][0].lower() + first["msg"][1:]
     return f"setting {name!r} is {first['input']!r}: {remedy.replace('input should be', 'it must be')}"

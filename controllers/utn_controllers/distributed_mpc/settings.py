@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from utn_sumo.contract import Network
 
@@ -17,7 +17,7 @@ class Settings(BaseModel):
     horizon: int = Field(7, ge=1, le=60)
     """Kp, control steps predicted."""
     control_horizon: int = Field(4, ge=1, le=60)
-    """Kc, control steps in which the greens may change; held after it."""
+    """Kc, control steps in which the greens may change, held after it; 4, or Kp where that is less."""
     cost: Literal["tts", "paper"] = "tts"
     q: float = Field(0.1, ge=0)
     """Q of the paper's cost: weight of x^2."""
@@ -33,6 +33,20 @@ class Settings(BaseModel):
     tolerance_abs: float = Field(1e-2, gt=0)
     """Absolute tolerance of the residuals [veh]."""
     tolerance_rel: float = Field(1e-3, ge=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_horizon(cls, values: Any) -> Any:
+        if isinstance(values, dict) and isinstance(values.get("horizon"), int):
+            return {"control_horizon": max(1, min(4, values["horizon"])), **values}
+        return values
+
+    @model_validator(mode="after")
+    def _horizons_fit(self) -> Self:
+        if self.control_horizon > self.horizon:
+            message = f"control_horizon {self.control_horizon} is beyond horizon {self.horizon}: make it at most that"
+            raise ValueError(message)
+        return self
 
     def stage_cost(self, x: Any, waiting: Any, part: Network) -> Any:
         """Cost of one predicted step, in CasADi symbols: x and the source queues of a junction's links."""
