@@ -10,6 +10,7 @@ Each prints a table, or with --json one object (traffic: a list of objects).
 from __future__ import annotations
 
 import json
+import math
 import os
 import statistics
 import subprocess
@@ -179,7 +180,7 @@ def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, 
             runs = [r for r in results if r["controller"] == name and r["demand"] == demand]
             spent = {r["seed"]: r["total_time_spent_veh_h"] for r in runs}
             first = first or spent
-            ratios = [first[seed] / spent[seed] for seed in spent]
+            ratios = [first[seed] / spent[seed] if spent[seed] else math.nan for seed in spent]
             alarms = sum(r["unsafe_signal_s"] + r["fallbacks"] + r["teleports"] for r in runs)
             rows.append(
                 [
@@ -187,7 +188,7 @@ def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, 
                     name,
                     " ".join(f"{value:.0f}" for value in spent.values()),
                     f"{statistics.median(spent.values()):.0f}",
-                    f"{statistics.median(first.values()) / statistics.median(spent.values()):.3f}",
+                    f"{statistics.median(first.values()) / (statistics.median(spent.values()) or math.nan):.3f}",
                     f"{min(ratios):.3f}-{max(ratios):.3f}",
                     str(sum(r["gridlock"] for r in runs)),
                     str(alarms),

@@ -42,22 +42,20 @@ def run(
     """
     net = network.load(scenario.net)
     controller = controllers.build(scenario.controller, net, scenario.settings)
-    folder = recording.new_folder(folder, _default_name(scenario))
     step_s, duration_s = net.control_step_s, scenario.duration_s
     steps = int(np.ceil(duration_s / step_s))
-    routes = folder / "routes.rou.xml"
-    shutil.copyfile(
-        demand.route_file(
-            net,
-            profile=scenario.profile,
-            duration_s=duration_s,
-            step_s=step_s,
-            scale=scenario.demand,
-            noise=scenario.noise,
-            seed=scenario.seed,
-        ),
-        routes,
+    drawn = demand.route_file(
+        net,
+        profile=scenario.profile,
+        duration_s=duration_s,
+        step_s=step_s,
+        scale=scenario.demand,
+        noise=scenario.noise,
+        seed=scenario.seed,
     )
+    folder = recording.new_folder(folder, _default_name(scenario))
+    routes = folder / "routes.rou.xml"
+    shutil.copyfile(drawn, routes)
     shutil.copyfile(net.net_file, folder / "net.net.xml")
     profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
     predictor = ProfileForecast(profile_veh_h * step_s / 3600)
@@ -87,12 +85,14 @@ def run(
                     }
                 )
                 state = estimator.update(seen, predictor.expected_veh(step))
-                tally.add(decision, plant, seen.left_veh)
+                tally.add(decision, plant, np.bincount(net.turn_link, seen.turned_veh).astype(float))
                 if on_cycle:
                     queue_veh = float(seen.queue_veh.sum() + state.source_queue_veh.sum())
                     on_cycle(Progress(plant.time_s, duration_s, tally.time_spent_veh_h, queue_veh))
         except KeyboardInterrupt:
             interrupted = True
+        finally:
+            recorder.close()
     verdict = monitor.watch(net, folder / "signals.xml", plant.time_s)
     trips = metrics.trip_measures(folder / "trips.xml")
     elapsed_s = time.perf_counter() - started
@@ -118,7 +118,7 @@ def run(
         "fallback_reasons": tally.fallback_reasons[:20],
         "out": str(folder),
     }
-    recorder.close(result)
+    recording.write_json(folder / recording.RESULT, result)
     return result
 
 

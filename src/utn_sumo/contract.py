@@ -52,6 +52,8 @@ class Turn:
     """Index of the link fed, or EXIT."""
     fraction: float
     """beta_{z,d}: share of the link's traffic that takes this turn."""
+    via_lanes: tuple[str, ...]
+    """SUMO lanes inside the junction that carry this turn and no other."""
 
 
 @dataclass(frozen=True)
@@ -243,16 +245,16 @@ class Measurement:
     """End of the step."""
     entered_veh: Floats
     """(Z,) over the loops at the link's entry."""
-    left_veh: Floats
-    """(Z,) over the loops at its stop line."""
-    to_edge_veh: Floats
-    """(M,) over the entry loops of the edge that the turn leads to, whoever fed it."""
+    turned_veh: Floats
+    """(M,) over the loops just behind the stop line, where the turns part."""
     queue_veh: Floats
     """(Z,) standing in the lane-area detectors at the end."""
     seen_veh: Floats
     """(Z,) in the lane-area detectors at the end, moving or not."""
     entry_occupancy: Floats
     """(Z,) share of the step in which the entry loops were covered, 0 to 1."""
+    stop_line_occupancy: Floats
+    """(Z,) the same of the loops at the stop line."""
 
 
 @dataclass(frozen=True)

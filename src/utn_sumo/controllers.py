@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from utn_sumo.contract import Controller, Network
-from utn_sumo.errors import ControllerError, SettingError, did_you_mean
+from utn_sumo.errors import ControllerError, SettingError, UtnError, did_you_mean
 from utn_sumo.scenario import explain
 
 GROUP = "utn_sumo.controllers"
@@ -25,6 +25,8 @@ def registered() -> dict[str, EntryPoint]:
 def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
     """The controller called `name`, built for `network`. Raises ControllerError or SettingError."""
     factory = _from_file(name) if ".py:" in name else _registered(name)
+    if not callable(factory):
+        raise ControllerError(f"controller {name!r} is {factory!r}: name a class")
     takes = settings_of(factory)
     for word in settings:
         if word not in takes:
@@ -34,6 +36,10 @@ def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
         controller = factory(network, **settings)
     except ValidationError as error:
         raise SettingError(f"controller {name!r}: {explain(error, takes)}") from error
+    except UtnError:
+        raise
+    except Exception as error:
+        raise ControllerError(f"controller {name!r} can't be built: {_told(error)}") from error
     if not isinstance(controller, Controller):
         raise ControllerError(
             f"controller {name!r} lacks `horizon` or `plan(state, forecast)`: see contract.Controller"
@@ -62,7 +68,15 @@ def _from_file(name: str) -> Any:
     if spec is None or spec.loader is None or not Path(path).is_file():
         raise ControllerError(f"controller {name!r}: there is no file {path!r}")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ControllerError(f"controller {name!r}: {path!r} can't be loaded: {_told(error)}") from error
     if not hasattr(module, attribute):
         raise ControllerError(f"controller {name!r}: {path!r} has no class {attribute!r}")
     return getattr(module, attribute)
+
+
+def _told(error: Exception) -> str:
+    """What a user's own code raised, in one line: the kind, the text, the line of their file where there is one."""
+    return " ".join(f"{type(error).__name__}: {error}".split())

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from utn_sumo.contract import EXIT, Floats, Network
+from utn_sumo.errors import SettingError
 
 LOW_VEH_H, HIGH_VEH_H = 300.0, 800.0
 PAPER_MEAN_VEH_H, PAPER_SD_VEH_H = 550.0, 125.0
@@ -89,16 +90,19 @@ def route_file(
     steps = int(np.ceil(duration_s / step_s))
     rates = drawn_rates_veh_h(network, profile, steps, scale=scale, noise=noise, seed=seed)
     trips = _trips(network, rates, step_s, duration_s, seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".part", delete=False, encoding="utf-8") as part:
-        part.write("<routes>\n")
-        for number, (depart_s, edges) in enumerate(trips):
-            part.write(
-                f'  <vehicle id="v{number}" depart="{depart_s:.2f}" departLane="best" departSpeed="max">'
-                f"<route edges={quoteattr(' '.join(edges))}/></vehicle>\n"
-            )
-        part.write("</routes>\n")
-    Path(part.name).replace(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".part", delete=False, encoding="utf-8") as part:
+            part.write("<routes>\n")
+            for number, (depart_s, edges) in enumerate(trips):
+                part.write(
+                    f'  <vehicle id="v{number}" depart="{depart_s:.2f}" departLane="best" departSpeed="max">'
+                    f"<route edges={quoteattr(' '.join(edges))}/></vehicle>\n"
+                )
+            part.write("</routes>\n")
+        Path(part.name).replace(path)
+    except OSError as error:
+        raise SettingError(f"cache folder {str(folder)!r} can't be used ({error.strerror}): set UTN_CACHE") from error
     return path
 
 

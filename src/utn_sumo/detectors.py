@@ -1,8 +1,10 @@
 """Loops and lane-area detectors of a network, as a SUMO additional file.
 
-Every lane of a link has a loop at its entry and one at its stop line, and a lane-area detector on the last 200 m
-before it; every road that leads away has entry loops too, so that turns can be told apart. All report once a control
-step, which is when they are read: interval counts, never sums of steps (SPEC 6).
+Every lane of a link has a loop at its entry, one at its stop line, and a lane-area detector on the last 200 m
+before it. What leaves is counted by loops just behind the stop line, on the lanes on which the turns part: a loop
+before the line misses a vehicle that changes lanes in the very step in which it crosses (38 of 42,900 in 4 h of
+`utn17`), and could not tell turns apart. All report once a control step, which is when they are read: interval
+counts, never sums of steps (SPEC 6).
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
 STOP_LINE_M = -1.0
 """Stop-line loops stand this far before the end of the last edge."""
+TURN_M = 1.0
+"""Turn loops stand this far behind the stop line."""
 
 
 AREA_REACH_M = 200.0
@@ -29,8 +33,8 @@ class DetectorIds:
 
     entry: tuple[tuple[str, ...], ...]
     stop_line: tuple[tuple[str, ...], ...]
+    turn: tuple[tuple[str, ...], ...]
     area: tuple[tuple[str, ...], ...]
-    to_edge: tuple[tuple[str, ...], ...]
 
 
 def ids(network: Network) -> DetectorIds:
@@ -42,10 +46,10 @@ def ids(network: Network) -> DetectorIds:
     return DetectorIds(
         entry=tuple(on("entry", link.edges[0]) for link in network.links),
         stop_line=tuple(on("stop", link.edges[-1]) for link in network.links),
+        turn=tuple(tuple(f"turn_{lane}" for lane in turn.via_lanes) for turn in network.turns),
         area=tuple(
             tuple(name for edge, _ in _watched(network, link) for name in on("area", edge)) for link in network.links
         ),
-        to_edge=tuple(on("entry", turn.to_edge) for turn in network.turns),
     )
 
 
@@ -64,37 +68,27 @@ def _watched(network: Network, link: Link) -> list[tuple[str, float]]:
 def write(network: Network, path: Path, period_s: float) -> None:
     """Write the additional file; its detectors report every `period_s` seconds."""
     root = ET.Element("additional")
-    entries = {link.edges[0] for link in network.links} | {turn.to_edge for turn in network.turns}
+    report = {"period": f"{period_s:g}", "file": "NUL", "friendlyPos": "true"}
 
-    def loops(kind: str, edge: str, position_m: float) -> None:
-        for lane in range(network.edge_lanes[edge]):
-            ET.SubElement(
-                root,
-                "inductionLoop",
-                id=f"{kind}_{edge}_{lane}",
-                lane=f"{edge}_{lane}",
-                pos=f"{position_m:g}",
-                period=f"{period_s:g}",
-                file="NUL",
-                friendlyPos="true",
-            )
+    def loop(name: str, lane: str, position_m: float) -> None:
+        ET.SubElement(root, "inductionLoop", {"id": name, "lane": lane, "pos": f"{position_m:g}", **report})
 
-    for edge in sorted(entries):
-        loops("entry", edge, ENTRY_M)
     for link in network.links:
-        loops("stop", link.edges[-1], STOP_LINE_M)
-        for edge, seen_m in _watched(network, link):
+        for kind, edge, position_m in (("entry", link.edges[0], ENTRY_M), ("stop", link.edges[-1], STOP_LINE_M)):
             for lane in range(network.edge_lanes[edge]):
-                ET.SubElement(
-                    root,
-                    "laneAreaDetector",
-                    id=f"area_{edge}_{lane}",
-                    lane=f"{edge}_{lane}",
-                    pos=f"{network.edge_length_m[edge] - seen_m:g}",
-                    endPos=f"{network.edge_length_m[edge]:g}",
-                    period=f"{period_s:g}",
-                    file="NUL",
-                    friendlyPos="true",
-                )
+                loop(f"{kind}_{edge}_{lane}", f"{edge}_{lane}", position_m)
+        for watched, seen_m in _watched(network, link):
+            length_m = network.edge_length_m[watched]
+            for lane in range(network.edge_lanes[watched]):
+                place = {
+                    "id": f"area_{watched}_{lane}",
+                    "lane": f"{watched}_{lane}",
+                    "pos": f"{length_m - seen_m:g}",
+                    "endPos": f"{length_m:g}",
+                }
+                ET.SubElement(root, "laneAreaDetector", {**place, **report})
+    for turn in network.turns:
+        for via in turn.via_lanes:
+            loop(f"turn_{via}", via, TURN_M)
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")

@@ -1,9 +1,8 @@
 """Detector counts to the state vector: vehicles, queues, source queues, turning counts, all in veh.
 
-x is counted in and out at the loops, so that it is conserved from link to link; the lane-area detectors bound
-it, so that a miscount can't live on for ever. q comes from the lane-area detectors. Turning counts are the table
-that the stop-line counts (rows) and the entry counts of the next roads (columns) allow, nearest to the
-turning fractions (iterative proportional fitting).
+x is counted in at the entry loops and out at the turn loops, so that it is conserved from link to link; the
+lane-area detectors bound it, so that a miscount can't live on for ever. q comes from the lane-area detectors,
+and its split by turn from who came and who went.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ FULL_SHARE = 0.8
 """Share of its storage from which the watched stretch counts as full, and the queue as reaching beyond it."""
 BLOCKED_SHARE = 0.5
 """Share of its storage from which a source link may be turning traffic away: one lane can be full before the other."""
-FITTING_ROUNDS = 20
 
 
 class CountingEstimator:
@@ -42,12 +40,12 @@ class CountingEstimator:
         """The state after one more control step. `expected_veh` (Z,) is the demand forecast for that step."""
         network = self.network
         unwatched_veh = network.storage_veh - self._watched_veh
-        counted = self._x_veh + seen.entered_veh - seen.left_veh
+        turned = seen.turned_veh
+        counted = self._x_veh + seen.entered_veh - self._by_link(turned)
         # What the lane-area detectors see is there; what they don't see must fit on the rest of the road.
         self._x_veh = np.clip(counted, seen.seen_veh, seen.seen_veh + unwatched_veh)
         self._past_inflow_veh = np.vstack([seen.entered_veh, self._past_inflow_veh[:-1]])
 
-        turned = turning_counts(network, seen)
         queue = self._queue(seen)
         # Who is queued for which turn: what was queued and came less what went, brought to the queue's measure.
         before = self._by_link(self._q_veh)
@@ -82,28 +80,3 @@ class CountingEstimator:
             past_inflow_veh=self._past_inflow_veh.copy(),
             turned_veh=turned_veh,
         )
-
-
-def turning_counts(network: Network, seen: Measurement) -> Floats:
-    """(M,) vehicles that made each turn, summing by link to exactly what left it.
-
-    Iterative proportional fitting (Deming and Stephan 1940) of the turning fractions to the counts at the
-    stop lines and at the entries of the roads that follow; the last fit is to the stop lines.
-    """
-    roads = {edge: row for row, edge in enumerate(dict.fromkeys(turn.to_edge for turn in network.turns))}
-    road = np.array([roads[turn.to_edge] for turn in network.turns])
-    arrived_at_road = np.zeros(len(roads))
-    arrived_at_road[road] = seen.to_edge_veh
-
-    table = network.fraction * seen.left_veh[network.turn_link]
-    for _ in range(FITTING_ROUNDS):
-        columns = np.bincount(road, table, minlength=len(roads))
-        table = table * (arrived_at_road / np.maximum(columns, 1e-9))[road]
-        rows = np.bincount(network.turn_link, table, minlength=len(network.links))
-        # Where the fit took all traffic off a link that did discharge, start over from its fractions.
-        table = np.where(
-            rows[network.turn_link] > 0,
-            table * (seen.left_veh / np.maximum(rows, 1e-9))[network.turn_link],
-            network.fraction * seen.left_veh[network.turn_link],
-        )
-    return np.asarray(table)

@@ -167,7 +167,7 @@ class LinkModel:
         room = ops.maximum(self.room_veh(state.x_veh), 0.0)
         feeding = ops.matmul(self.feeds, fraction)
         # Each turn's share of the room on the link that it feeds; exits have all the room in the world.
-        claim = fraction / (ops.matmul(self.feeds.T, feeding) + self._is_exit)
+        claim = fraction / ops.maximum(ops.matmul(self.feeds.T, feeding) + self._is_exit, 1e-9)
         oversaturated = claim * ops.matmul(self.feeds.T, room) + INFINITE_ROOM_VEH * self._is_exit
         limit = ops.minimum(saturated, oversaturated)
 

@@ -13,7 +13,8 @@ from pathlib import Path
 from utn_sumo.contract import Junction, Network
 from utn_sumo.errors import ResultError
 
-LETTERS = frozenset("GgyrsuoO")
+LETTERS = frozenset("Ggyrsu")
+"""What a working signal shows; SUMO's o and O are signals switched off."""
 GREEN = "Gg"
 
 
@@ -121,7 +122,7 @@ class _Guard:
                 return f"goes from green to {now!r} without yellow"
             if second - self.green_since[signal] < self.junction.min_green_s:
                 return "was green for less than its least"
-        elif was == "y" and now != "y" and second - self.yellow_since[signal] < self.yellow_s:
+        if was == "y" and now != "y" and second - self.yellow_since[signal] < self.yellow_s:
             return "had too little yellow"
         return ""
 

@@ -7,6 +7,7 @@ its clearance, taken from the net and never optimised. Conflicts come from the n
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -157,7 +158,7 @@ class _Reader:
             if total <= 0:
                 raise NetworkError(f"link {edge_id!r}: its turning fractions sum to {total}: give it some")
             turns += [
-                Turn(index, edge.getID(), self._fed_link(edge.getID()), weight / total)
+                Turn(index, edge.getID(), self._fed_link(edge.getID()), weight / total, _via_lanes(outgoing[edge]))
                 for edge, weight in zip(targets, weights, strict=True)
             ]
         return turns
@@ -212,6 +213,14 @@ def _stages(tls_id: str, program: Any, junction: int, signal_turn: list[int]) ->
     return stages
 
 
+def _via_lanes(connections: list[Any]) -> tuple[str, ...]:
+    lanes = [connection.getViaLaneID() for connection in connections]
+    if not all(lanes):
+        edge = connections[0].getFrom().getID()
+        raise NetworkError(f"link {edge!r} has no lanes inside its junction: build the net with internal links")
+    return tuple(sorted(lanes))
+
+
 def _is_green(state: str) -> bool:
     return any(letter in "Gg" for letter in state) and not any(letter in "yYu" for letter in state)
 
@@ -227,9 +236,13 @@ def _read_fractions(net_path: Path) -> dict[tuple[str, str], float]:
         return {}
     try:
         relations = ElementTree.parse(path).iter("edgeRelation")
-        return {(r.get("from"), r.get("to")): float(r.get("probability")) for r in relations}
+        fractions = {(r.get("from"), r.get("to")): float(r.get("probability")) for r in relations}
     except (ElementTree.ParseError, DefusedXmlException, TypeError, ValueError) as error:
         raise NetworkError(f"turning fractions {str(path)!r} can't be read ({error})") from error
+    for (start, end), value in fractions.items():
+        if not 0 <= value < math.inf:
+            raise NetworkError(f"turning fractions {str(path)!r}: {start} to {end} is {value:g}: give 0 or more")
+    return fractions
 
 
 def _natural(text: str) -> tuple[int, int, str]:

@@ -11,9 +11,12 @@ result.json     the measures of SPEC 7
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -29,9 +32,7 @@ def new_folder(path: Path | None, default_name: str) -> Path:
     Raises ResultError if the named folder holds anything: results are never overwritten.
     """
     if path is None:
-        base = Path("results")
-        names = [default_name, *(f"{default_name}-{n}" for n in range(2, 10_000))]
-        path = next(base / name for name in names if not (base / name).exists())
+        return _numbered(Path("results"), default_name)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise ResultError(
             f"output folder {str(path)!r} exists and holds results: name another with --out, or remove it"
@@ -41,6 +42,20 @@ def new_folder(path: Path | None, default_name: str) -> Path:
     except OSError as error:
         raise ResultError(f"output folder {str(path)!r} can't be made ({error.strerror}): name another") from error
     return path
+
+
+def _numbered(base: Path, name: str) -> Path:
+    """A new folder `base/name`, or `base/name-2`, ...: made and claimed in one step, for runs side by side."""
+    for number in itertools.count(1):
+        path = base / (name if number == 1 else f"{name}-{number}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ResultError(f"folder {str(path)!r} can't be made ({error.strerror}): name one with --out") from error
+        return path
+    raise AssertionError
 
 
 class Recorder:
@@ -56,10 +71,9 @@ class Recorder:
         self._cycles.write(json.dumps(plain(record)) + "\n")
         self._cycles.flush()
 
-    def close(self, result: Mapping[str, Any]) -> None:
-        """Write the result and end the record."""
+    def close(self) -> None:
+        """End the record of cycles."""
         self._cycles.close()
-        write_json(self.folder / RESULT, result)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -79,14 +93,17 @@ def read_json(folder: Path, name: str) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses and arrays as JSON has them; numbers rounded to six digits after the point."""
+    """Anything as JSON has it: numbers rounded to six digits after the point, null for one that is not finite,
+    text for what JSON does not know.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return np.round(value, 6).tolist()
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    value = value.item() if isinstance(value, np.generic) else value
-    return round(value, 6) if isinstance(value, float) else value
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value if isinstance(value, bool | int | str | NoneType) else repr(value)

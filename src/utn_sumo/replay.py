@@ -21,9 +21,12 @@ def write(folder: Path) -> Path:
 
     Raises ResultError if the folder holds no finished run, or holds a replay already.
     """
-    settings = recording.read_json(folder, recording.SETTINGS)["scenario"]
+    settings = recording.read_json(folder, recording.SETTINGS)
     result = recording.read_json(folder, recording.RESULT)
-    duration_s = round(result["hours"] * 3600)
+    try:
+        seed, duration_s = int(settings["scenario"]["seed"]), round(result["hours"] * 3600)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultError(f"{str(folder)!r} lacks a run's seed or length: give one that `utn run` wrote") from error
     target = folder / FOLDER
     if target.exists():
         raise ResultError(f"{str(target)!r} is there already: remove it to write the replay anew")
@@ -38,7 +41,7 @@ def write(folder: Path) -> Path:
         Path("../routes.rou.xml"),
         [Path(signals.name)],
         Path(),
-        seed=settings["seed"],
+        seed=seed,
         duration_s=duration_s,
     )
     configuration = target / "run.sumocfg"

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from utn_sumo.errors import SettingError, did_you_mean
 
@@ -31,6 +31,14 @@ class Scenario(BaseModel):
     """Standard deviation of the correlated noise on the demand, relative."""
     seed: int = Field(1, ge=0, le=2**31 - 1)
 
+    @field_validator("hours")
+    @classmethod
+    def _lasts(cls, hours: float) -> float:
+        if hours * 3600 < 1:
+            message = "it must last a second or more"
+            raise ValueError(message)
+        return hours
+
     @property
     def duration_s(self) -> float:
         return round(self.hours * 3600)
@@ -46,8 +54,11 @@ def scenario(file: Path | None = None, **given: Any) -> Scenario:
         try:
             values = tomllib.loads(file.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise SettingError(f"scenario file {str(file)!r} can't be read ({error})") from error
-    settings = {**values.get("settings", {}), **given.pop("settings", {})}
+            raise SettingError(f"scenario file {str(file)!r} can't be read ({error}): name a TOML file") from error
+    table = values.get("settings", {})
+    if not isinstance(table, dict):
+        raise SettingError(f"setting 'settings' is {table!r}: it must be a table of the controller's settings")
+    settings = {**table, **given.pop("settings", {})}
     try:
         return Scenario(**{**values, **given, "settings": settings})
     except ValidationError as error:
@@ -60,7 +71,8 @@ def explain(error: ValidationError, known: Iterable[str]) -> str:
     name = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         return f"setting {name!r} is unknown: {did_you_mean(name, known)}"
+    message = first["msg"].removeprefix("Value error, ")
     if not name:
-        return first["msg"].removeprefix("Value error, ")
-    remedy = first["msg"][0].lower() + first["msg"][1:]
+        return message
+    remedy = message[0].lower() + message[1:]
     return f"setting {name!r} is {first['input']!r}: {remedy.replace('input should be', 'it must be')}"

@@ -23,7 +23,10 @@ def admit(plan: Plan, network: Network) -> Plan:
     Checked are its shape, that it is finite, each stage's least green, each junction's sum against
     what its cycle leaves, and then the programme that results from it.
     """
-    green_s = np.asarray(plan.green_s, dtype=float)
+    try:
+        green_s = np.asarray(plan.green_s, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise PlanError(f"plan is no row of numbers ({error})") from error
     if green_s.shape != (len(network.stages),):
         raise PlanError(f"plan has shape {green_s.shape}: give one green for each of {len(network.stages)} stages")
     if not np.isfinite(green_s).all():

@@ -12,7 +12,6 @@ from typing import Literal
 
 from utn_sumo import signals
 from utn_sumo.contract import Controller, Forecast, Network, Plan, State
-from utn_sumo.errors import PlanError
 
 Rung = Literal["solved", "shifted", "backup"]
 
@@ -35,6 +34,8 @@ class Supervisor:
     def __init__(self, network: Network, controller: Controller):
         self.network = network
         self.controller = controller
+        # Raises PlanError at the start of a run, and not amid it, if the net's own stages can't be shown safely.
+        self._backup = signals.admit(network.equal_split(), network)
         self._ahead: list[Plan] = []
         """What the last solved plan foresaw, next cycle first."""
 
@@ -44,16 +45,16 @@ class Supervisor:
         try:
             wish = self.controller.plan(state, forecast)
             plan = signals.admit(wish, self.network)
+            ahead = [] if wish.ahead_s is None else [Plan(green_s) for green_s in wish.ahead_s]
         except Exception as error:  # noqa: BLE001 - a foreign controller may raise anything
             reason = f"{type(error).__name__}: {error}"
         else:
-            ahead = [] if wish.ahead_s is None else [Plan(green_s) for green_s in wish.ahead_s]
             self._ahead = ahead
             return Decision(plan, "solved", "", time.perf_counter() - started)
         spent_s = time.perf_counter() - started
         if self._ahead:
             try:
                 return Decision(signals.admit(self._ahead.pop(0), self.network), "shifted", reason, spent_s)
-            except PlanError as error:
+            except Exception as error:  # noqa: BLE001 - nor is what it foresaw to be trusted
                 reason = f"{reason}; the last plan's rest: {error}"
-        return Decision(self.network.equal_split(), "backup", reason, spent_s)
+        return Decision(self._backup, "backup", reason, spent_s)

@@ -64,6 +64,18 @@ class Layout:
         return cls(green, leaving, inflow, over, size=start)
 
 
+def remaining_steps(network: Network) -> Floats:
+    """(Z,) control steps that a vehicle on each link still needs to leave the network.
+
+    Free travel and half a cycle's wait on each link of its expected way, summed by the turning fractions.
+    """
+    own = network.free_time_s / network.control_step_s + 0.5
+    fed = np.flatnonzero(network.turn_next >= 0)
+    onward = np.zeros((len(network.links), len(network.links)))
+    np.add.at(onward, (network.turn_link[fed], network.turn_next[fed]), network.fraction[fed])
+    return np.asarray(np.linalg.solve(np.eye(len(network.links)) - onward, own), dtype=float)
+
+
 class JunctionProblem:
     """The problem of one junction: numbers in (state, forecast), quadratic programme out."""
 
@@ -80,6 +92,7 @@ class JunctionProblem:
         self._numbers = LinkModel(self.part, network.control_step_s)
         self._lags = network.delay_steps
         self.model.lags = self._numbers.lags = self._lags
+        self._remaining = remaining_steps(network)[self.links]
         self._bind(self._state_problem())
 
     def consumed(self) -> list[int]:
@@ -109,12 +122,17 @@ class JunctionProblem:
         q = state.q_veh[self.turns]
         queue = self._numbers.leaves @ q
         share = self._numbers.on_the_way(self._numbers.delay_s(queue))
+        # A miscount must not leave more on the way than there is: the first step would have no feasible flow.
+        past = state.past_inflow_veh[: self._lags, self.links]
+        still = np.sum([part * inflow for part, inflow in zip(share[1:], past, strict=False)], axis=0)
+        moving = np.maximum(state.x_veh[self.links] - queue, 0.0)
+        past = past * np.minimum(1.0, moving / np.maximum(still, 1e-9))
         parameters = np.concatenate(
             [
                 state.x_veh[self.links],
                 q,
                 state.source_queue_veh[self.links],
-                state.past_inflow_veh[: self._lags, self.links].ravel(),
+                past.ravel(),
                 forecast.demand_veh[: self.settings.horizon, self.links].ravel(),
                 np.concatenate(share),
                 self.network.fraction[self.turns],
@@ -231,7 +249,7 @@ class JunctionProblem:
             cost += REGULARISATION / 2 * (ca.sumsqr(leaving) + ca.sumsqr(inflow) + ca.sumsqr(over))
             if step < settings.control_horizon:
                 cost += settings.green_cost(green)
-        return cost, rows
+        return cost + settings.terminal_cost(x, waiting, self._remaining), rows
 
     def _simple_bounds(self) -> tuple[Floats, Floats]:
         lower, upper = np.zeros(self.layout.size), np.full(self.layout.size, np.inf)

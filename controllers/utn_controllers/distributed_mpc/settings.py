@@ -12,7 +12,7 @@ from utn_sumo.contract import Network
 class Settings(BaseModel):
     """What a user may set; every field is checked when the controller is built."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     horizon: int = Field(7, ge=1, le=60)
     """Kp, control steps predicted."""
@@ -25,6 +25,8 @@ class Settings(BaseModel):
     """R of the paper's cost: weight of g^2 (g in s)."""
     crowding: float = Field(1.0, ge=0)
     """Weight of x^2 / storage beside the time spent in the `tts` cost: what keeps room on the links."""
+    terminal: float = Field(1.0, ge=0)
+    """Weight of the time that the vehicles left at the horizon's end still need, in the `tts` cost."""
     iterations: int = Field(20, ge=1, le=1000)
     """Most ADMM iterations in a control step."""
     rho: float = Field(0.2, gt=0)
@@ -55,6 +57,14 @@ class Settings(BaseModel):
         if self.cost == "paper":
             return self.q * (ca.sumsqr(x) + ca.sumsqr(waiting))
         return ca.sum1(x) + ca.sum1(waiting) + self.crowding * ca.sum1(x**2 / part.storage_veh)
+
+    def terminal_cost(self, x: Any, waiting: Any, remaining: Any) -> Any:
+        """Cost of what is left at the end of the horizon; `remaining` (Z,) steps still to travel from each link."""
+        import casadi as ca  # noqa: PLC0415 - heavy
+
+        if self.cost == "paper":
+            return 0
+        return self.terminal * (ca.dot(remaining, x) + ca.dot(remaining, waiting))
 
     def green_cost(self, green: Any) -> Any:
         """Cost of one step's greens."""

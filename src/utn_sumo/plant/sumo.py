@@ -1,9 +1,9 @@
 """SUMO as the plant: the one door to libsumo.
 
 How a plan is handed over (tests/integration/test_plant.py shows 0.0 s of drift): at the second in which a junction's
-cycle begins, `setProgramLogic` replaces its programme and `setPhaseDuration` gives the green that
-has just begun its new length, so that the plan acts from that very second. Between two
-junctions' boundaries the simulation jumps.
+cycle begins, `setProgramLogic` replaces its programme, which alone would leave the first green its old length, and
+`setPhase` starts that green anew, so that the plan acts from that very second. Between two junctions' boundaries
+the simulation jumps.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class SumoPlant:
         """Wall time spent inside SUMO: start, steps, close."""
         self.truth: Truth | None = None
         self._ids = detectors.ids(network)
-        self._boundary_s = [junction.offset_s for junction in network.junctions]
+        self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
         self._sumo: Any = None
 
     def __enter__(self) -> Self:
@@ -144,9 +144,7 @@ class SumoPlant:
             lights.Phase(float(duration), state) for state, duration in cycle_phases(self.network, index, green_s)
         ]
         lights.setProgramLogic(junction.id, lights.Logic(PROGRAM, 0, 0, phases))
-        lights.setProgram(junction.id, PROGRAM)
         lights.setPhase(junction.id, 0)
-        lights.setPhaseDuration(junction.id, float(green_s[junction.stages[0]]))
 
     def _by_edge(self, getter: Any) -> Floats:
         return np.array([float(sum(map(getter, link.edges))) for link in self.network.links])
@@ -157,16 +155,22 @@ class SumoPlant:
         def total(getter: Any, groups: Sequence[Sequence[str]]) -> Floats:
             return np.array([float(sum(map(getter, group))) for group in groups])
 
-        counted, seen = loop.getLastIntervalVehicleNumber, area.getLastStepVehicleNumber
-        lanes = np.array([len(group) for group in self._ids.entry])
+        # A run may end amid an interval; then what the interval has so far is the count of its last, short step.
+        whole = self.time_s % self.network.control_step_s == 0
+        counted = loop.getLastIntervalVehicleNumber if whole else loop.getIntervalVehicleNumber
+        covered = loop.getLastIntervalOccupancy if whole else loop.getIntervalOccupancy
+
+        def occupancy(groups: Sequence[Sequence[str]]) -> Floats:
+            return np.asarray(total(covered, groups) / (100 * np.array([len(group) for group in groups])))
+
         return Measurement(
             time_s=self.time_s,
             entered_veh=total(counted, self._ids.entry),
-            left_veh=total(counted, self._ids.stop_line),
-            to_edge_veh=total(counted, self._ids.to_edge),
+            turned_veh=total(counted, self._ids.turn),
             queue_veh=total(area.getLastStepHaltingNumber, self._ids.area),
-            seen_veh=total(seen, self._ids.area),
-            entry_occupancy=total(loop.getLastIntervalOccupancy, self._ids.entry) / (100 * lanes),
+            seen_veh=total(area.getLastStepVehicleNumber, self._ids.area),
+            entry_occupancy=occupancy(self._ids.entry),
+            stop_line_occupancy=occupancy(self._ids.stop_line),
         )
 
 

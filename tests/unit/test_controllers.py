@@ -1,0 +1,135 @@
+"""Controllers are found by name or in a user's file; what is wrong with them is said in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from utn_controllers.distributed_mpc import DistributedMPC
+from utn_controllers.fixed_time import FixedTime
+from utn_sumo import controllers
+from utn_sumo.contract import Network
+from utn_sumo.errors import ControllerError, SettingError, UtnError
+
+OWN = """
+class Mine:
+    horizon = 3
+    def __init__(self, network, gain=1.0):
+        self.gain, self.network = gain, network
+    def plan(self, state, forecast):
+        return self.network.equal_split()
+
+class Needy(Mine):
+    def __init__(self, network, gain):
+        super().__init__(network, gain)
+
+class Touchy(Mine):
+    def __init__(self, network):
+        raise RuntimeError("not today")
+
+class Planless:
+    horizon = 1
+    def __init__(self, network):
+        pass
+
+number = 5
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    path = tmp_path / "own.py"
+    path.write_text(OWN, encoding="utf-8")
+    return path
+
+
+def complaint(net: Network, name: str, kind: type[UtnError] = ControllerError, **settings: Any) -> str:
+    with pytest.raises(kind) as caught:
+        controllers.build(name, net, settings)
+    line = str(caught.value)
+    assert "\n" not in line
+    return line
+
+
+def test_our_own_controllers_are_registered_by_name(utn17: Network) -> None:
+    assert {"fixed", "dmpc"} <= set(controllers.registered())
+    assert isinstance(controllers.build("fixed", utn17, {}), FixedTime)
+    assert isinstance(controllers.build("dmpc", utn17, {"horizon": 5}), DistributedMPC)
+
+
+def test_fixed_time_gives_the_equal_split(utn17: Network) -> None:
+    plan = controllers.build("fixed", utn17, {}).plan(None, None)  # type: ignore[arg-type]
+    assert plan.green_s.tolist() == utn17.equal_split().green_s.tolist()
+
+
+def test_an_unknown_controller_is_answered_with_the_nearest_known_one(utn17: Network) -> None:
+    line = complaint(utn17, "dmcp")
+    assert "'dmcp' is unknown" in line
+    assert "did you mean 'dmpc'?" in line
+    assert "path.py:Class" in line
+
+
+def test_a_class_in_a_file_is_a_controller(utn17: Network, own: Path) -> None:
+    mine: Any = controllers.build(f"{own}:Mine", utn17, {"gain": 2.5})
+    assert mine.gain == 2.5
+    assert mine.horizon == 3
+    assert np.isfinite(mine.plan(None, None).green_s).all()
+
+
+def test_an_unknown_setting_is_named_beside_the_known_ones(utn17: Network, own: Path) -> None:
+    line = complaint(utn17, "dmpc", SettingError, horizn=5)
+    assert "'dmpc' has no setting 'horizn'" in line
+    assert "did you mean 'horizon'?" in line
+    assert "it takes none" in complaint(utn17, "fixed", SettingError, gain=1)
+    assert "did you mean 'gain'?" in complaint(utn17, f"{own}:Mine", SettingError, gian=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("horizon", 0),
+        ("horizon", "long"),
+        ("control_horizon", 61),
+        ("cost", "time"),
+        ("q", -1),
+        ("iterations", 0),
+        ("rho", 0),
+        ("relaxation", 2),
+        ("tolerance_abs", 0),
+    ],
+)
+def test_a_bad_setting_of_the_distributed_mpc_is_named_with_its_value(utn17: Network, name: str, value: Any) -> None:
+    line = complaint(utn17, "dmpc", SettingError, **{name: value})
+    assert "'dmpc'" in line
+    assert f"setting {name!r} is {value!r}: it must be" in line
+
+
+def test_a_control_horizon_beyond_the_horizon_is_refused(utn17: Network) -> None:
+    line = complaint(utn17, "dmpc", SettingError, horizon=3, control_horizon=5)
+    assert "control_horizon 5" in line
+    assert "horizon 3" in line
+
+
+def test_a_missing_file_or_class_is_named(utn17: Network, own: Path) -> None:
+    assert "there is no file 'nowhere.py'" in complaint(utn17, "nowhere.py:Mine")
+    assert "has no class 'Yours'" in complaint(utn17, f"{own}:Yours")
+
+
+def test_a_class_that_can_not_plan_is_refused(utn17: Network, own: Path) -> None:
+    assert "lacks" in complaint(utn17, f"{own}:Planless")
+
+
+@pytest.mark.parametrize("name", ["Needy", "Touchy", "number"])
+def test_a_class_that_can_not_be_built_is_refused_in_one_line(utn17: Network, own: Path, name: str) -> None:
+    assert name in complaint(utn17, f"{own}:{name}", UtnError)
+
+
+@pytest.mark.parametrize(
+    "content", ["class Mine(:", "import no_such_module", "1 / 0"], ids=["syntax", "import", "failure"]
+)
+def test_a_file_that_does_not_import_is_refused_in_one_line(utn17: Network, own: Path, content: str) -> None:
+    own.write_text(content, encoding="utf-8")
+    assert "own.py" in complaint(utn17, f"{own}:Mine")

@@ -1,0 +1,251 @@
+"""The shipped networks are SPEC 1's, and a net that can't be used is refused in one line."""
+
+from __future__ import annotations
+
+import gzip
+import shutil
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import utn_network
+from utn_sumo import network
+from utn_sumo.contract import EXIT, Network
+from utn_sumo.errors import NetworkError
+
+# SPEC 1's table: link -> (origin, junction that it enters, turns).
+TABLE: dict[str, tuple[str, str, dict[str, float]]] = {
+    "1": ("source", "J1", {"10": 0.70, "W1": 0.30}),
+    "2": ("J2", "J1", {"W1": 0.40, "10": 0.40, "N1": 0.20}),
+    "3": ("source", "J1", {"10": 0.80, "N1": 0.20}),
+    "4": ("J3", "J2", {"2": 0.60, "N2": 0.40}),
+    "5": ("J6", "J2", {"N2": 0.50, "2": 0.50}),
+    "6": ("source", "J3", {"4": 0.70, "N3": 0.30}),
+    "7": ("J7", "J3", {"N3": 0.50, "4": 0.50}),
+    "8": ("source", "J4", {"11": 0.70, "N4": 0.30}),
+    "9": ("source", "J4", {"N4": 0.50, "11": 0.50}),
+    "10": ("J1", "J5", {"12": 0.50, "S5": 0.50}),
+    "11": ("J4", "J5", {"12": 0.60, "S5": 0.40}),
+    "12": ("J5", "J6", {"14": 0.50, "5": 0.50}),
+    "13": ("J8", "J6", {"5": 0.60, "14": 0.40}),
+    "14": ("J6", "J7", {"E7": 0.60, "7": 0.40}),
+    "15": ("source", "J7", {"7": 0.60, "E7": 0.40}),
+    "16": ("source", "J8", {"13": 0.70, "E8": 0.30}),
+    "17": ("source", "J8", {"E8": 0.50, "13": 0.50}),
+}
+CIRCUITS = (("5", "2", "10", "12", "5"), ("7", "4", "2", "10", "12", "14", "7"))
+
+
+@pytest.fixture(params=["utn17", "utn17-long"])
+def net(request: pytest.FixtureRequest, utn17: Network, utn17_long: Network) -> Network:
+    return utn17 if request.param == "utn17" else utn17_long
+
+
+def turns_by_link(net: Network) -> dict[str, dict[str, float]]:
+    turns: dict[str, dict[str, float]] = {link.id: {} for link in net.links}
+    for turn in net.turns:
+        turns[net.links[turn.link].id][turn.to_edge] = turn.fraction
+    return turns
+
+
+def test_links_and_junctions_are_those_of_the_table(net: Network) -> None:
+    assert [junction.id for junction in net.junctions] == [f"J{number}" for number in range(1, 9)]
+    assert {link.id: net.junctions[link.junction].id for link in net.links} == {
+        link: junction for link, (_, junction, _) in TABLE.items()
+    }
+
+
+def test_turning_fractions_are_those_of_the_table(net: Network) -> None:
+    found = turns_by_link(net)
+    assert {link: set(turns) for link, turns in found.items()} == {link: set(row[2]) for link, row in TABLE.items()}
+    for link, (_, _, turns) in TABLE.items():
+        assert found[link] == pytest.approx(turns)
+
+
+def test_traffic_from_outside_enters_at_the_eight_sources_alone(net: Network) -> None:
+    assert {link.id for link in net.links if link.is_source} == {"1", "3", "6", "8", "9", "15", "16", "17"}
+
+
+def test_traffic_leaves_by_the_eight_exits_alone(net: Network) -> None:
+    exits = {turn.to_edge for turn in net.turns if turn.next_link == EXIT}
+    assert exits == {"W1", "N1", "N2", "N3", "N4", "S5", "E7", "E8"}
+    assert all(net.links[turn.next_link].id == turn.to_edge for turn in net.turns if turn.next_link != EXIT)
+
+
+def test_every_inner_link_is_fed_by_links_that_enter_its_origin(net: Network) -> None:
+    for link, (origin, _, _) in TABLE.items():
+        feeders = {net.links[turn.link].id for turn in net.turns if turn.to_edge == link}
+        expected = {other for other, (_, junction, turns) in TABLE.items() if junction == origin and link in turns}
+        assert feeders == expected
+        assert bool(feeders) == (origin != "source")
+
+
+def test_there_are_nine_interactions_between_neighbours_and_two_circuits(net: Network) -> None:
+    assert sum(not link.is_source for link in net.links) == 9
+    turns = turns_by_link(net)
+    assert all(after in turns[before] for circuit in CIRCUITS for before, after in pairwise(circuit))
+
+
+def test_every_incoming_link_has_one_stage_of_its_own(net: Network) -> None:
+    assert [len(junction.stages) for junction in net.junctions] == [3, 2, 2, 2, 2, 2, 2, 2]
+    served = [{net.turns[turn].link for turn in stage.turns} for stage in net.stages]
+    assert sorted(link for links in served for link in links) == list(range(17))
+    assert all(len(links) == 1 for links in served)
+    assert net.serves.sum(axis=0).tolist() == [1] * len(net.turns)
+
+
+def test_every_stage_is_cleared_by_three_seconds_of_yellow_and_two_of_red(net: Network) -> None:
+    for stage in net.stages:
+        yellow = "".join("y" if letter in "Gg" else "r" for letter in stage.state)
+        assert stage.clearance == ((yellow, 3.0), ("r" * len(yellow), 2.0))
+        assert stage.clearance_s == 5
+
+
+def test_cycles_last_two_minutes_and_leave_what_the_clearances_do_not_take(net: Network) -> None:
+    assert net.cycle_s.tolist() == [120] * 8
+    assert net.green_budget_s.tolist() == [105] + [110] * 7
+    assert net.min_green_s.tolist() == [10] * 17
+    assert net.control_step_s == 120
+
+
+def test_no_stage_opens_two_conflicting_streams(net: Network) -> None:
+    for stage in net.stages:
+        conflicts = np.array(net.junctions[stage.junction].conflicts)
+        green = [signal for signal, letter in enumerate(stage.state) if letter in "Gg"]
+        assert not conflicts[np.ix_(green, green)].any()
+
+
+def test_conflicts_are_mutual_and_nobody_conflicts_with_itself(net: Network) -> None:
+    for junction in net.junctions:
+        conflicts = np.array(junction.conflicts)
+        assert conflicts.shape == (len(junction.signal_turn),) * 2
+        assert (conflicts == conflicts.T).all()
+        assert not conflicts.diagonal().any()
+
+
+def test_any_two_links_of_a_junction_have_streams_that_cross(net: Network) -> None:
+    for position, junction in enumerate(net.junctions):
+        signal_link = np.array([net.turns[turn].link for turn in junction.signal_turn])
+        conflicts = np.array(junction.conflicts)
+        for a, b in combinations(np.flatnonzero(net.link_junction == position), 2):
+            assert conflicts[np.ix_(signal_link == a, signal_link == b)].any()
+
+
+def test_links_of_utn17_hold_about_106_vehicles(utn17: Network) -> None:
+    assert all(379 <= link.length_m <= 396 for link in utn17.links)
+    assert utn17.storage_veh == pytest.approx(106, rel=0.05)
+
+
+def test_links_of_utn17_long_hold_about_1000_vehicles(utn17_long: Network) -> None:
+    assert utn17_long.storage_veh == pytest.approx(1000, rel=0.01)
+    assert utn17_long.free_time_s == pytest.approx(337, rel=0.01)
+
+
+def test_links_have_two_lanes_and_a_free_speed_of_40_km_h(net: Network) -> None:
+    assert {link.lanes for link in net.links} == {2}
+    assert all(link.free_speed_m_s == pytest.approx(40 / 3.6, abs=0.01) for link in net.links)
+
+
+@pytest.mark.parametrize("junction", range(8))
+def test_a_part_keeps_its_links_turns_and_stages_together(net: Network, junction: int) -> None:
+    part, whole = net.part(junction), net.junctions[junction]
+    own = [link.id for link in net.links if link.junction == junction]
+    assert [link.id for link in part.links] == own
+    assert turns_by_link(part) == {link: turns_by_link(net)[link] for link in own}
+    assert part.junctions[0].id == whole.id
+    assert part.green_budget_s.tolist() == [net.green_budget_s[junction]]
+    for inside, outside in zip(part.stages, whole.stages, strict=True):
+        assert inside.state == net.stages[outside].state
+        assert inside.clearance == net.stages[outside].clearance
+        assert names_of_turns(part, inside.turns) == names_of_turns(net, net.stages[outside].turns)
+    assert names_of_turns(part, part.junctions[0].signal_turn) == names_of_turns(net, whole.signal_turn)
+    assert part.turn_next.tolist() == [EXIT] * len(part.turns)
+
+
+def names_of_turns(net: Network, turns: tuple[int, ...]) -> list[tuple[str, str]]:
+    return [(net.links[net.turns[turn].link].id, net.turns[turn].to_edge) for turn in turns]
+
+
+def test_the_backup_plan_shares_each_cycle_equally_in_whole_seconds(net: Network) -> None:
+    assert net.equal_split().green_s.tolist() == [35] * 3 + [55] * 14
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> Path:
+    """A copy of utn17's net without its turning fractions."""
+    return Path(shutil.copyfile(utn_network.net_file("utn17"), tmp_path / "town.net.xml"))
+
+
+def test_a_net_of_the_users_own_is_read_like_a_shipped_one(town: Path, utn17: Network) -> None:
+    shutil.copyfile(utn_network.turns_file("utn17"), town.with_name("town.turns.xml"))
+    found = network.load(str(town))
+    assert found.name == "town"
+    assert (found.links, found.turns, found.stages) == (utn17.links, utn17.turns, utn17.stages)
+
+
+def test_a_compressed_net_is_read_like_a_plain_one(town: Path, utn17: Network) -> None:
+    shutil.copyfile(utn_network.turns_file("utn17"), town.with_name("town.turns.xml"))
+    packed = town.with_name("town.net.xml.gz")
+    packed.write_bytes(gzip.compress(town.read_bytes()))
+    assert network.load(str(packed)).turns == utn17.turns
+
+
+def test_without_a_turns_file_lanes_share_the_traffic(town: Path) -> None:
+    turns = turns_by_link(network.load(str(town)))
+    assert turns["1"] == pytest.approx({"10": 2 / 3, "W1": 1 / 3})
+    assert all(sum(fractions.values()) == pytest.approx(1) for fractions in turns.values())
+
+
+def one_line_of(name: str) -> str:
+    with pytest.raises(NetworkError) as caught:
+        network.load(name)
+    line = str(caught.value)
+    assert "\n" not in line
+    return line
+
+
+def test_an_unknown_net_is_answered_with_the_nearest_known_one(tmp_path: Path) -> None:
+    assert "did you mean 'utn17'" in one_line_of("utn71")
+    assert "nowhere.net.xml" in one_line_of(str(tmp_path / "nowhere.net.xml"))
+    assert str(tmp_path) in one_line_of(str(tmp_path))
+
+
+@pytest.mark.parametrize("content", ["", "no XML at all", "<net><edge", '<net version="1.20"></edge>'])
+def test_an_unreadable_net_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "bad.net.xml"
+    path.write_text(content, encoding="utf-8")
+    assert str(path) in one_line_of(str(path))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_cut_off_net_is_refused_in_one_line(town: Path, share: float) -> None:
+    content = town.read_bytes()
+    town.write_bytes(content[: int(share * len(content))])
+    assert str(town) in one_line_of(str(town))
+
+
+def test_a_net_without_traffic_lights_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "dark.net.xml"
+    path.write_text('<net version="1.20"></net>', encoding="utf-8")
+    assert "no traffic lights" in one_line_of(str(path))
+
+
+@pytest.mark.parametrize(
+    "relations",
+    [
+        '<edgeRelation from="1" to="10" probability="most"/>',
+        '<edgeRelation from="1" to="10"/>',
+        '<edgeRelation from="1" to="10" probability="0"/>',
+        '<edgeRelation from="1" to="10" probability="nan"/>',
+        '<edgeRelation from="1" to="10" probability="inf"/>',
+        '<edgeRelation from="1" to="10" probability="-0.5"/><edgeRelation from="1" to="W1" probability="1.5"/>',
+        "<edgeRelation",
+    ],
+    ids=["a word", "nothing", "zero in all", "not a number", "infinite", "negative", "cut off"],
+)
+def test_a_bad_turns_file_beside_a_net_is_refused_in_one_line(town: Path, relations: str) -> None:
+    content = f"<data><interval>{relations}</interval></data>"
+    town.with_name("town.turns.xml").write_text(content, encoding="utf-8")
+    assert "turning fractions" in one_line_of(str(town))
