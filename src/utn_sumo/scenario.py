@@ -35,7 +35,7 @@ class Scenario(BaseModel):
     @classmethod
     def _lasts(cls, hours: float) -> float:
         if hours * 3600 < 1:
-            message = "it must last a second or more"
+            message = "it must be a second or more"
             raise ValueError(message)
         return hours
 
