@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import utn_sumo
-from utn_sumo import controllers, demand, metrics, monitor, network, recording
+from utn_sumo import calibration, controllers, demand, metrics, monitor, network, recording
 from utn_sumo.contract import Floats
 from utn_sumo.estimation import CountingEstimator
 from utn_sumo.plant.sumo import SumoPlant
@@ -41,7 +41,9 @@ def run(
     A KeyboardInterrupt ends the run early with a whole, readable result that says so. Raises UtnError.
     """
     net = network.load(scenario.net)
-    controller = controllers.build(scenario.controller, net, scenario.settings)
+    # Estimator, controller and model see the calibrated links; plant and demand are what they are.
+    known = calibration.for_model(net, scenario.calibration)
+    controller = controllers.build(scenario.controller, known, scenario.settings)
     step_s, duration_s = net.control_step_s, scenario.duration_s
     steps = int(np.ceil(duration_s / step_s))
     drawn = demand.route_file(
@@ -59,7 +61,7 @@ def run(
     shutil.copyfile(net.net_file, folder / "net.net.xml")
     profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
     predictor = ProfileForecast(profile_veh_h * step_s / 3600)
-    estimator = CountingEstimator(net)
+    estimator = CountingEstimator(known)
     supervisor = Supervisor(net, controller)
     tally = _Tally()
     interrupted = False

@@ -28,6 +28,7 @@ def cli() -> None:
 @click.option("--profile", help="Demand profile: peak, paper or constant.  [peak]")
 @click.option("--noise", help="Relative standard deviation of correlated demand noise.  [0]")
 @click.option("--seed", help="Seed of demand and SUMO.  [1]")
+@click.option("--calibration", help="Calibration file for the model, or none.  [the one beside the net]")
 @click.option("--horizon", help="Prediction horizon Kp of a predictive controller, in cycles.  [7]")
 @click.option("--control-horizon", help="Control horizon Kc, in cycles.  [4]")
 @click.option("--cost", help="Cost of a predictive controller: tts or paper.  [tts]")
@@ -54,6 +55,68 @@ def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bo
     click.echo(json.dumps(result)) if as_json else report.table(result)
     if result["interrupted"]:
         raise KeyboardInterrupt
+
+
+@cli.command()
+@click.option("--net", default="utn17", show_default=True, help="Shipped network, or a .net.xml file.")
+@click.option("--controller", default="dmpc", show_default=True, help="Controller of the recorded runs.")
+@click.option("--demand", default="0.6,1.0,1.3", show_default=True, help="Demands, separated by commas.")
+@click.option("--seeds", default="5", show_default=True, help="How many seeds, from 1 on.")
+@click.option("--hours", default="2", show_default=True)
+@click.option("--horizon", default="7", show_default=True, help="Control steps ahead.")
+@click.option("--step", default="10", show_default=True, help="The model's step in seconds; 120 is the whole cycle.")
+@click.option("--inputs", default="known", show_default=True, help="Demand of the predictions: known or forecast.")
+@click.option("--calibration", help="Calibration file, or none.  [the one beside the net]")
+@click.option("--floor/--no-floor", "with_floor", default=True, help="Measure the spread of SUMO itself too.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON list, an object a demand, and nothing else.")
+def mismatch(out: Path | None, with_floor: bool, as_json: bool, demand: str, **flags: Any) -> None:
+    """Measure how far the model is from the plant, in open loop, by horizon and link."""
+    from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
+
+    base = {name: flags[name] for name in ("net", "controller", "hours", "calibration") if flags[name] is not None}
+    demands, seeds = _numbers("demand", demand), range(1, 1 + _whole("seeds", flags["seeds"]))
+    horizon, step_s = _whole("horizon", flags["horizon"]), _numbers("step", flags["step"])[0]
+    folder = recording.new_folder(out, f"mismatch-{Path(flags['net']).name.partition('.')[0]}-{flags['controller']}")
+    total = len(demands) * (len(seeds) + with_floor)
+    with report.counter("runs and replays", total) as tick:
+        results = study.study_mismatch(
+            base,
+            demands,
+            seeds,
+            folder,
+            step_s=step_s,
+            horizon=horizon,
+            inputs=flags["inputs"],
+            with_floor=with_floor,
+            tick=tick,
+        )
+    recording.write_json(folder / "mismatch.json", {"results": results})
+    click.echo(json.dumps(recording.plain(results))) if as_json else report.mismatch_table(results, folder)
+
+
+@cli.command()
+@click.option("--net", default="utn17", show_default=True, help="Shipped network, or a .net.xml file.")
+@click.option("--controller", default="dmpc", show_default=True, help="Controller of the recorded runs.")
+@click.option("--demand", default="0.7,0.9,1.1,1.25", show_default=True, help="Demands, separated by commas.")
+@click.option("--seeds", default="201,202", show_default=True, help="Seeds, separated by commas.")
+@click.option("--hours", default="2", show_default=True)
+@click.option(
+    "--out", required=True, type=click.Path(path_type=Path), help="Folder for the runs; must be new or empty."
+)
+def calibrate(out: Path, demand: str, seeds: str, **flags: Any) -> None:
+    """Fit the model to recorded runs and write its parameters with their standard errors."""
+    from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
+
+    demands, seed_list = _numbers("demand", demand), [int(seed) for seed in _numbers("seeds", seeds)]
+    base = {**flags, "calibration": "none"}
+    folder = recording.new_folder(out, "calibration")
+    with report.counter("runs", len(demands) * len(seed_list)) as tick:
+        content = study.study_calibration(base, demands, seed_list, folder, tick=tick)
+    path = folder / "calibration.json"
+    recording.write_json(path, content)
+    report.calibration_table(content)
+    click.echo(f"wrote {path}: use it with  utn run --calibration {path}, or put it beside the net")
 
 
 @cli.command()
@@ -112,6 +175,21 @@ def _builder() -> Any:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def _numbers(name: str, text: str) -> list[float]:
+    """Numbers separated by commas. Raises SettingError."""
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise SettingError(f"setting {name!r} is {text!r}: it must be numbers separated by commas") from error
+
+
+def _whole(name: str, text: str) -> int:
+    """A whole number from 1 on. Raises SettingError."""
+    if not text.isdecimal() or int(text) == 0:
+        raise SettingError(f"setting {name!r} is {text!r}: it must be a whole number from 1 on")
+    return int(text)
 
 
 def _number(text: str | None) -> Any:

@@ -101,6 +101,8 @@ class Network:
     edge_lanes: Mapping[str, int]
     """Lanes of every SUMO edge that a link or a turn names."""
     edge_length_m: Mapping[str, float]
+    startup_lag_s: float
+    """Time from the start of green until the queue moves over the stop line; the yellow gives it back at its end."""
 
     @cached_property
     def turn_link(self) -> Ints:
@@ -221,6 +223,7 @@ class Network:
             ),
             edge_lanes=self.edge_lanes,
             edge_length_m=self.edge_length_m,
+            startup_lag_s=self.startup_lag_s,
         )
 
     def link_index(self, link_id: str) -> int:

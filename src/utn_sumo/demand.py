@@ -14,7 +14,6 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import numpy.typing as npt
 
 from utn_sumo.contract import EXIT, Floats, Network
 from utn_sumo.errors import SettingError
@@ -111,8 +110,6 @@ def _trips(
 ) -> list[tuple[float, list[str]]]:
     """(departure time, edges) of every vehicle, in order of departure."""
     trips: list[tuple[float, int, list[str]]] = []
-    turns_of = [np.flatnonzero(network.turn_link == link) for link in range(len(network.links))]
-    cumulative = [np.cumsum(network.fraction[turns]) for turns in turns_of]
     for source in np.flatnonzero(network.is_source):
         rng = np.random.default_rng([seed, 0xA7, int(source)])
         counts = rng.poisson(rates_veh_h[:, source] * step_s / 3600)
@@ -120,26 +117,20 @@ def _trips(
             [step * step_s + np.sort(rng.uniform(0, step_s, n)) for step, n in enumerate(counts)]
         )
         trips += [
-            (float(depart_s), int(source), _route(network, int(source), turns_of, cumulative, rng))
+            (float(depart_s), int(source), onward(network, int(source), rng))
             for depart_s in departures[departures < duration_s]
         ]
     trips.sort(key=lambda trip: trip[:2])
     return [(depart_s, edges) for depart_s, _, edges in trips]
 
 
-def _route(
-    network: Network,
-    source: int,
-    turns_of: list[npt.NDArray[np.int64]],
-    cumulative: list[Floats],
-    rng: np.random.Generator,
-) -> list[str]:
-    """Edges of one vehicle from its source, turn by turn, until it leaves the network."""
-    edges = list(network.links[source].edges)
-    link = source
+def onward(network: Network, link: int, rng: np.random.Generator) -> list[str]:
+    """Edges of one vehicle from the start of a link, turn by turn, until it leaves the network."""
+    edges = list(network.links[link].edges)
     while True:
-        position = int(np.searchsorted(cumulative[link], rng.uniform(), side="right"))
-        turn = network.turns[turns_of[link][min(position, len(turns_of[link]) - 1)]]
+        turns = np.flatnonzero(network.turn_link == link)
+        position = int(np.searchsorted(np.cumsum(network.fraction[turns]), rng.uniform(), side="right"))
+        turn = network.turns[turns[min(position, len(turns) - 1)]]
         if turn.next_link == EXIT:
             return [*edges, turn.to_edge]
         link = turn.next_link

@@ -25,19 +25,28 @@ class Operations(Protocol):
     def matmul(self, matrix: Floats, vector: Any) -> Any: ...
     def minimum(self, a: Any, b: Any) -> Any: ...
     def maximum(self, a: Any, b: Any) -> Any: ...
+    def settled(self, a: Any, b: Any) -> bool:
+        """Whether a sweep changed nothing any more, where that can be known."""
+
+
+SETTLED_VEH = 1e-12
+"""Change of an inflow by a sweep under which it has settled."""
 
 
 class NumpyOperations:
-    """Numbers."""
+    """Numbers. The last axis is that of links, turns or stages; any axes before it are a batch of cases."""
 
     def matmul(self, matrix: Floats, vector: Any) -> Any:
-        return matrix @ vector
+        return vector @ matrix.T
 
     def minimum(self, a: Any, b: Any) -> Any:
         return np.minimum(a, b)
 
     def maximum(self, a: Any, b: Any) -> Any:
         return np.maximum(a, b)
+
+    def settled(self, a: Any, b: Any) -> bool:
+        return bool(np.max(np.abs(a - b), initial=0.0) < SETTLED_VEH)
 
 
 class CasadiOperations:
@@ -56,6 +65,9 @@ class CasadiOperations:
 
     def maximum(self, a: Any, b: Any) -> Any:
         return self._casadi.fmax(a, b)
+
+    def settled(self, a: Any, b: Any) -> bool:  # noqa: ARG002 - symbols never know
+        return False
 
 
 @dataclass(frozen=True)
@@ -84,6 +96,8 @@ class StepFlows:
     """(Z,) at the tail of the queue."""
 
 
+WAVE_SPEED_M_S = 6.0
+"""Speed at which a queue's start-up travels upstream: a standing vehicle's 7.5 m in about 1.3 s."""
 INFINITE_ROOM_VEH = 1e9
 """Room beyond an exit: the third term of SPEC 2.3 does not bind there."""
 
@@ -106,6 +120,9 @@ class LinkModel:
         self._is_exit = (~fed).astype(float)
         self._is_source = network.is_source.astype(float)
         self._saturation_veh_s = network.saturation_flow_veh_s[network.turn_link]
+        # Room that opens at the stop line reaches the entry as a wave: within one step, only so much of it does.
+        wave_s = np.array([link.length_m for link in network.links]) / WAVE_SPEED_M_S
+        self._room_share = np.minimum(1.0, step_s / wave_s)
         self._space_s_veh = network.free_time_s / network.storage_veh
         self.lags = 1 + int(np.ceil(network.free_time_s.max() / step_s))
         """Past inflows that the delay reaches back to."""
@@ -164,10 +181,12 @@ class LinkModel:
         ops = self.operations
         turn_green_s = ops.matmul(self.network.serves.T.astype(float), green_s)
         saturated = self.saturated_veh(turn_green_s, fraction)
-        room = ops.maximum(self.room_veh(state.x_veh), 0.0)
-        feeding = ops.matmul(self.feeds, fraction)
-        # Each turn's share of the room on the link that it feeds; exits have all the room in the world.
-        claim = fraction / ops.maximum(ops.matmul(self.feeds.T, feeding) + self._is_exit, 1e-9)
+        room = ops.maximum(self.room_veh(state.x_veh), 0.0) * self._room_share
+        # Each turn's share of the room on the link that it feeds, among the turns that have green in this step;
+        # exits have all the room in the world.
+        open_fraction = fraction * ops.minimum(turn_green_s, 1.0)
+        feeding = ops.matmul(self.feeds, open_fraction)
+        claim = open_fraction / ops.maximum(ops.matmul(self.feeds.T, feeding) + self._is_exit, 1e-9)
         oversaturated = claim * ops.matmul(self.feeds.T, room) + INFINITE_ROOM_VEH * self._is_exit
         limit = ops.minimum(saturated, oversaturated)
 
@@ -182,7 +201,9 @@ class LinkModel:
             arriving = ops.maximum(self.arriving_veh(moving, inflow, state.past_inflow_veh, share), 0.0)
             unsaturated = state.q_veh + fraction * ops.matmul(self.leaves.T, arriving)
             leaving = ops.minimum(unsaturated, limit)
-            inflow = entering + ops.matmul(self.feeds, leaving)
+            last, inflow = inflow, entering + ops.matmul(self.feeds, leaving)
+            if ops.settled(last, inflow):
+                break
 
         after = ModelState(
             x_veh=state.x_veh + inflow - ops.matmul(self.leaves, leaving),
@@ -191,3 +212,26 @@ class LinkModel:
             past_inflow_veh=(inflow, *state.past_inflow_veh[:-1]),
         )
         return after, StepFlows(leaving, inflow, arriving)
+
+
+def green_windows(network: Network, green_s: Floats, step_s: float) -> Floats:
+    """(..., steps, S) seconds of green of each stage in each model step of a control step.
+
+    `green_s` (..., S) is what was planned. A junction's cycle starts at its offset and repeats within the control
+    step; before its first start the previous repetition of the same plan is still running. Discharge starts
+    `startup_lag_s` after the green and runs as long into the yellow.
+    """
+    steps = round(network.control_step_s / step_s)
+    begin = np.arange(steps) * step_s
+    windows = np.zeros((*green_s.shape[:-1], steps, green_s.shape[-1]))
+    for junction in network.junctions:
+        repeats = int(np.ceil(network.control_step_s / junction.cycle_s))
+        for repeat in range(-1, repeats):
+            start = np.full(green_s.shape[:-1], junction.offset_s % junction.cycle_s + repeat * junction.cycle_s)
+            for stage in junction.stages:
+                end = start + green_s[..., stage]
+                shown = [np.asarray(edge + network.startup_lag_s)[..., None] for edge in (start, end)]
+                overlap = np.minimum(shown[1], begin + step_s) - np.maximum(shown[0], begin)
+                windows[..., stage] += np.maximum(overlap, 0.0)
+                start = end + network.stages[stage].clearance_s
+    return windows

@@ -21,6 +21,8 @@ SPACE_PER_VEHICLE_M = 7.5
 SATURATION_FLOW_VEH_S_LANE = 0.435
 """Queue discharge per second of green and lane. Measured on eight links of `utn17`: 0.42-0.45, with an intercept
 of 0 +- 0.8 veh a cycle, so that what start-up loses the yellow gives back."""
+STARTUP_LAG_S = 3.0
+"""From green to a moving queue, before calibration."""
 MIN_GREEN_S = 10.0
 
 
@@ -112,6 +114,7 @@ class _Reader:
             tuple(junctions),
             edge_lanes={edge: self.net.getEdge(edge).getLaneNumber() for edge in sorted(edges)},
             edge_length_m={edge: self.net.getEdge(edge).getLength() for edge in sorted(edges)},
+            startup_lag_s=STARTUP_LAG_S,
         )
 
     def _chain(self, approach: str) -> tuple[str, ...]:

@@ -11,16 +11,18 @@ result.json     the measures of SPEC 7
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import NoneType
 from typing import Any
 
 import numpy as np
 
+from utn_sumo.contract import Floats
 from utn_sumo.errors import ResultError
 
 SETTINGS, CYCLES, RESULT = "settings.json", "cycles.jsonl", "result.json"
@@ -107,3 +109,64 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return round(value, 6) if math.isfinite(value) else None
     return value if isinstance(value, bool | int | str | NoneType) else repr(value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Log:
+    """Recorded runs as arrays over their K control steps: what the model is held against.
+
+    The axis after that of the steps is that of the runs.
+    """
+
+    x_veh: Floats
+    """(K, runs, Z) estimated vehicles at the start of each step."""
+    q_veh: Floats
+    """(K, runs, M) estimated queues by turn at its start."""
+    source_queue_veh: Floats
+    """(K, runs, Z) estimated vehicles outside at its start."""
+    green_s: Floats
+    """(K, runs, S) greens that were applied."""
+    forecast_veh: Floats
+    """(K, runs, Z) demand that was forecast for the step."""
+    entered_veh: Floats
+    """(K, runs, Z) counted into each link."""
+    turned_veh: Floats
+    """(K, runs, M) counted out of it by turn."""
+    true_x_veh: Floats
+    """(K, runs, Z) vehicles at its end, as SUMO knows them."""
+    true_queue_veh: Floats
+    """(K, runs, Z) halting vehicles at its end."""
+    true_waiting_veh: Floats
+    """(K, runs, Z) vehicles waiting outside at its end."""
+
+    @classmethod
+    def stack(cls, logs: Sequence[Log]) -> Log:
+        """Several runs of the same length as one log."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: np.concatenate([getattr(log, name) for log in logs], axis=1) for name in names})
+
+
+def read_log(folder: Path) -> Log:
+    """The cycles of a result folder as the arrays of one run. Raises ResultError."""
+    places = {
+        "x_veh": ("state", "x_veh"),
+        "q_veh": ("state", "q_veh"),
+        "source_queue_veh": ("state", "source_queue_veh"),
+        "green_s": ("decision", "plan", "green_s"),
+        "forecast_veh": ("forecast", "demand_veh", 0),
+        "entered_veh": ("seen", "entered_veh"),
+        "turned_veh": ("seen", "turned_veh"),
+        "true_x_veh": ("truth", "x_veh"),
+        "true_queue_veh": ("truth", "queue_veh"),
+        "true_waiting_veh": ("truth", "waiting_veh"),
+    }
+    try:
+        lines = (folder / CYCLES).read_text(encoding="utf-8").splitlines()
+        records = [json.loads(line) for line in lines]
+        columns = {
+            name: np.array([functools.reduce(lambda at, key: at[key], path, record) for record in records], dtype=float)
+            for name, path in places.items()
+        }
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise ResultError(f"{str(folder)!r} holds no readable {CYCLES}: give a folder that `utn run` wrote") from error
+    return Log(**{name: column[:, None] for name, column in columns.items()})

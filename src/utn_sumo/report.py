@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -13,6 +15,8 @@ from rich.table import Table
 from utn_sumo.bridge import Progress as RunProgress
 from utn_sumo.scenario import Scenario
 
+FLOOR_LIMIT = 1.5
+"""Links whose error is beyond this many times the floor are named."""
 ROWS = [
     ("total_time_spent_veh_h", "total time spent", "veh h", "{:.1f}"),
     ("total_delay_veh_h", "total delay", "veh h", "{:.1f}"),
@@ -77,3 +81,72 @@ def table(result: dict[str, Any]) -> None:
     if result["interrupted"]:
         console.print("stopped before its end: the measures cover the time that was run")
     console.print(f"results: {result['out']}", markup=False)
+
+
+@contextmanager
+def counter(label: str, total: int) -> Iterator[Callable[[], None]]:
+    """A progress bar over `total` like pieces of work; it shows up with the first of them."""
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    )
+    task = bar.add_task(label, total=total)
+
+    def tick() -> None:
+        bar.start()
+        bar.advance(task)
+
+    try:
+        yield tick
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
+    """Error by demand and step ahead, the links that are worst against the floor, and where the rest is."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    for result in results:
+        title = (
+            "{controller} on {net}, demand {demand:g}, {n} seeds, model step {step_s:g} s, demand {inputs}, "
+            "turning by fractions"
+        ).format(n=len(result["seeds"]), **result)
+        view = Table(title=title, title_justify="left")
+        heads = {
+            "rmse_veh": "RMSE x (veh)",
+            "bias_veh": "bias x (veh)",
+            "rmse_over_persistence": "over persistence",
+            "rmse_over_history": "over historical mean",
+            "rmse_over_floor": "over floor",
+            "queue_rmse_veh": "RMSE q (veh)",
+            "flow_rmse_veh": "RMSE inflow (veh)",
+        }
+        shown = [key for key in heads if key in result]
+        view.add_column("cycles ahead")
+        for key in shown:
+            view.add_column(heads[key], justify="right")
+        for ahead in range(len(result["rmse_veh"])):
+            view.add_row(str(ahead + 1), *(f"{result[key][ahead]:.3f}" for key in shown))
+        console.print(view)
+        if "rmse_over_floor" in result:
+            over = {link: values["rmse_over_floor"][0] for link, values in result["links"].items()}
+            worse = sorted((link for link in over if over[link] > FLOOR_LIMIT), key=lambda link: -over[link])
+            listed = ", ".join(f"{link} ({over[link]:.2f})" for link in worse) or "none"
+            console.print(f"links over {FLOOR_LIMIT} of the floor one cycle ahead: {listed}", markup=False)
+    console.print(f"plots and mismatch.json: {folder}", markup=False)
+
+
+def calibration_table(content: dict[str, Any]) -> None:
+    """Parameters by link with their standard errors."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    view = Table(title="start-up lag {:.2f} s (standard error {:.2f})".format(*content["startup_lag_s"]))
+    keys = ("saturation_flow_veh_s", "storage_veh", "free_speed_m_s")
+    for head in ("link", *keys, "turns"):
+        view.add_column(head)
+    for link, values in content["links"].items():
+        turns = "  ".join("{} {:.3f} ({:.3f})".format(edge, *pair) for edge, pair in values["turns"].items())
+        view.add_row(link, *("{:.3f} ({:.3f})".format(*values[key]) for key in keys), turns)
+    console.print(view)

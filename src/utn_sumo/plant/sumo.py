@@ -9,7 +9,7 @@ the simulation jumps.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -35,6 +35,8 @@ class Truth:
     """(Z,) vehicles on each link at the end of the step."""
     waiting_veh: Floats
     """(Z,) vehicles that wait to be inserted on each link at its end."""
+    queue_veh: Floats
+    """(Z,) halting vehicles on each link at its end."""
     max_x_veh: Floats
     """(Z,) largest sampled number of vehicles on each link."""
     max_queue_veh: Floats
@@ -126,11 +128,29 @@ class SumoPlant:
                 waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
                 present = self._sumo.vehicle.getIDCount() + waiting.sum()
                 spent_veh_s += present * (self.time_s - before_s)
-                np.maximum(peak_queue, self._by_edge(self._sumo.edge.getLastStepHaltingNumber), out=peak_queue)
-            self.truth = Truth(x_veh, waiting, peak_x, peak_queue, self._sumo.vehicle.getIDCount(), spent_veh_s / 3600)
+                queue_veh = self._by_edge(self._sumo.edge.getLastStepHaltingNumber)
+                np.maximum(peak_queue, queue_veh, out=peak_queue)
+            self.truth = Truth(
+                x_veh, waiting, queue_veh, peak_x, peak_queue, self._sumo.vehicle.getIDCount(), spent_veh_s / 3600
+            )
             return self._measure()
         except (self._sumo.TraCIException, self._sumo.FatalTraCIError) as error:
             raise PlantError(f"SUMO broke off at {self.time_s:g} s ({_first_line(error)})") from error
+
+    def redraw(self, onward: Callable[[int], list[str]], rng: np.random.Generator, speed_share: float) -> None:
+        """Give every vehicle on the road a new future: another way after its next junction, a slightly other speed.
+
+        `onward` draws the edges from the start of a link to an exit.
+        """
+        vehicles = self._sumo.vehicle
+        first_edge = {link.edges[0]: index for index, link in enumerate(self.network.links)}
+        for name in sorted(vehicles.getIDList()):
+            route, at = vehicles.getRoute(name), vehicles.getRouteIndex(name)
+            ahead = next((place for place in range(at + 1, len(route)) if route[place] in first_edge), None)
+            if ahead is not None:
+                vehicles.setRoute(name, [*route[at:ahead], *onward(first_edge[route[ahead]])])
+            factor = vehicles.getSpeedFactor(name) * (1 + speed_share * rng.standard_normal())
+            vehicles.setSpeedFactor(name, factor)
 
     def _step(self) -> None:
         started = time.perf_counter()

@@ -1,0 +1,150 @@
+"""Link parameters from recorded runs: least squares on the model's one-step prediction error.
+
+Fitted by link: saturation flow, storage (which is the queue's spacing), free speed; for the network: the start-up lag;
+and turning fractions from the turn loops. Each comes with its standard error. A calibration is a JSON file beside the
+net, or named in a scenario; the demand and the plant never see it, only the model does.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from utn_sumo.contract import Floats, Network
+from utn_sumo.errors import NetworkError
+from utn_sumo.model import LinkModel
+from utn_sumo.recording import Log
+from utn_sumo.rollout import known_demand_veh, observe, roll
+
+STEP_S = 10.0
+"""Model step on which the parameters are fitted: the paper's sampling interval."""
+ERROR_VEH = 4.0
+"""Size of a one-step error, against which a parameter's distance from its prior weighs."""
+PRIOR_SHARE = 0.2
+"""Standard deviation of a parameter about its prior, relative: a link that never saturates keeps its flow."""
+LAG_PRIOR_S = 2.0
+EVALUATIONS = 8
+FITTED = ("saturation_flow_veh_s", "storage_veh", "free_speed_m_s")
+
+
+def calibrate(network: Network, log: Log) -> dict[str, Any]:
+    """Fit `network` to the runs of the log and return the calibration as it goes into its file.
+
+    `one_step_rmse_veh` is the error that is left in each of the runs, in their order.
+    """
+    from scipy.optimize import least_squares  # noqa: PLC0415 - heavy
+
+    fractions, fraction_sd = _fractions(network, log)
+    with_turns = _with_fractions(network, fractions)
+    size = len(FITTED) * len(network.links)
+    start = np.append(np.ones(size), network.startup_lag_s)
+    demand = known_demand_veh(network, log)
+
+    def residual(parameters: Floats) -> Floats:
+        model = LinkModel(_scaled(with_turns, parameters), STEP_S)
+        prediction = roll(model, log, observe(model, log), demand, 1)
+        error = prediction.x_veh[0] - log.true_x_veh[prediction.starts]
+        prior = np.append((parameters[:-1] - 1) / PRIOR_SHARE, (parameters[-1] - start[-1]) / LAG_PRIOR_S)
+        return np.concatenate([error.ravel() / ERROR_VEH, prior])
+
+    fit = least_squares(
+        residual,
+        start,
+        bounds=(np.append(np.full(size, 0.4), 0.0), np.append(np.full(size, 2.0), 10.0)),
+        diff_step=0.02,
+        x_scale=np.append(np.full(size, 0.1), 1.0),
+        max_nfev=EVALUATIONS,
+    )
+    error = fit.fun[: log.x_veh[0].size * (len(log.x_veh) - 1)].reshape(-1, *log.x_veh.shape[1:]) * ERROR_VEH
+    scale = 2 * fit.cost / max(len(fit.fun) - len(fit.x), 1)
+    sd = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * scale)
+    content = _content(_scaled(with_turns, fit.x), fit.x, sd, fraction_sd)
+    return {"one_step_rmse_veh": np.sqrt(np.mean(error**2, axis=(0, 2))).tolist(), **content}
+
+
+def _scaled(network: Network, parameters: Floats) -> Network:
+    """The network with its links' parameters times the given factors, and the start-up lag."""
+    factors = parameters[:-1].reshape(len(FITTED), -1)
+    links = tuple(
+        replace(
+            link, **{name: getattr(link, name) * float(row[index]) for name, row in zip(FITTED, factors, strict=True)}
+        )
+        for index, link in enumerate(network.links)
+    )
+    return replace(network, links=links, startup_lag_s=float(parameters[-1]))
+
+
+def _with_fractions(network: Network, fractions: Floats) -> Network:
+    turns = (replace(turn, fraction=float(share)) for turn, share in zip(network.turns, fractions, strict=True))
+    return replace(network, turns=tuple(turns))
+
+
+def _fractions(network: Network, log: Log) -> tuple[Floats, Floats]:
+    """(M,) turning fractions from the turn loops, one vehicle's worth of the table added, and standard errors."""
+    turned = network.fraction + log.turned_veh.sum(axis=(0, 1))
+    total = np.bincount(network.turn_link, turned)[network.turn_link]
+    share = turned / total
+    return share, np.sqrt(share * (1 - share) / total)
+
+
+def _content(network: Network, parameters: Floats, sd: Floats, fraction_sd: Floats) -> dict[str, Any]:
+    relative = (sd[:-1] / parameters[:-1]).reshape(len(FITTED), -1)
+    links: dict[str, Any] = {}
+    for index, link in enumerate(network.links):
+        links[link.id] = {
+            name: [getattr(link, name), getattr(link, name) * relative[row, index]] for row, name in enumerate(FITTED)
+        }
+        links[link.id]["turns"] = {
+            turn.to_edge: [turn.fraction, fraction_sd[position]]
+            for position, turn in enumerate(network.turns)
+            if turn.link == index
+        }
+    return {"startup_lag_s": [network.startup_lag_s, sd[-1]], "links": links}
+
+
+def for_model(network: Network, chosen: str | None) -> Network:
+    """The network as the model is to see it: with the calibration that is chosen, `none` for none, else the one
+    beside the net if there is one.
+    """
+    if chosen == "none":
+        return network
+    if chosen:
+        return applied(network, Path(chosen))
+    beside = beside_net(network)
+    return applied(network, beside) if beside.is_file() else network
+
+
+def beside_net(network: Network) -> Path:
+    """Where the calibration of a net lies that is taken without asking."""
+    stem = network.net_file.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net")
+    return network.net_file.with_name(f"{stem}.calibration.json")
+
+
+def applied(network: Network, path: Path) -> Network:
+    """The network with the parameters of a calibration file. Raises NetworkError if it does not fit the network."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        links = tuple(replace(link, **_values(content["links"][link.id])) for link in network.links)
+        turns = tuple(
+            replace(turn, fraction=float(content["links"][network.links[turn.link].id]["turns"][turn.to_edge][0]))
+            for turn in network.turns
+        )
+        lag_s = float(content["startup_lag_s"][0])
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise NetworkError(
+            f"calibration {str(path)!r} does not fit net {network.name!r} ({error}): make one with utn calibrate"
+        ) from error
+    return replace(network, links=links, turns=turns, startup_lag_s=lag_s)
+
+
+def _values(link: Mapping[str, Any]) -> dict[str, Any]:
+    values = {name: float(link[name][0]) for name in FITTED}
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} is {value:g}")
+    return values

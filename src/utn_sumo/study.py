@@ -1,0 +1,104 @@
+"""Studies over several runs, as the commands call them: mismatch of model and plant, calibration of the model."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from utn_sumo import bridge, calibration, floor, mismatch, network, plots, recording
+from utn_sumo.contract import Network
+from utn_sumo.errors import SettingError
+from utn_sumo.recording import Log
+from utn_sumo.scenario import Scenario, scenario
+
+FLOOR_CUTS = 4
+FLOOR_REPLICAS = 6
+INPUTS = ("known", "forecast")
+
+
+def record(scenarios: Sequence[Scenario], folder: Path, tick: Callable[[], None]) -> list[Path]:
+    """Run the scenarios in parallel processes and return their result folders; `tick` is called after each."""
+    jobs = [(item, folder / "runs" / f"demand{item.demand:g}-seed{item.seed}") for item in scenarios]
+    with ProcessPoolExecutor(os.cpu_count(), max_tasks_per_child=1) as pool:
+        for _ in pool.map(_record, jobs):
+            tick()
+    return [path for _, path in jobs]
+
+
+def _record(job: tuple[Scenario, Path]) -> None:
+    bridge.run(*job)
+
+
+def study_mismatch(
+    base: dict[str, Any],
+    demands: Sequence[float],
+    seeds: Sequence[int],
+    folder: Path,
+    *,
+    step_s: float,
+    horizon: int,
+    inputs: str,
+    with_floor: bool,
+    tick: Callable[[], None],
+) -> list[dict[str, Any]]:
+    """The mismatch by demand: one object each, under the names of `mismatch.summary`."""
+    if inputs not in INPUTS:
+        raise SettingError(f"setting 'inputs' is {inputs!r}: it must be 'known' or 'forecast'")
+    whole = network.load(base["net"])
+    model = calibration.for_model(whole, base.get("calibration"))
+    check_step(whole, step_s)
+    results = []
+    for demand in demands:
+        items = [scenario(**base, demand=demand, seed=seed) for seed in seeds]
+        folders = record(items, folder, tick)
+        log = Log.stack([recording.read_log(path) for path in folders])
+        if len(log.green_s) <= horizon + 1:
+            raise SettingError(f"setting 'hours' is {items[0].hours:g}: make it more than {horizon + 1} control steps")
+        floor_veh = None
+        if with_floor:
+            cuts = np.linspace(1, len(log.green_s) - horizon, FLOOR_CUTS + 2)[1:-1].astype(int)
+            floor_veh = floor.spread(whole, folders[0], cuts.tolist(), FLOOR_REPLICAS, horizon)
+            tick()
+        found = mismatch.errors(model, log, step_s, horizon, inputs)
+        results.append(
+            {
+                "net": base["net"],
+                "controller": items[0].controller,
+                "demand": demand,
+                "seeds": list(seeds),
+                "hours": items[0].hours,
+                "step_s": step_s,
+                "inputs": inputs,
+                "turning": "fractions of the calibration or the net",
+                **mismatch.summary(model, found, floor_veh),
+            }
+        )
+        plots.mismatch(results[-1], model, found, folder)
+    return results
+
+
+def check_step(net: Network, step_s: float) -> None:
+    """Raise SettingError unless the model's step divides the control step."""
+    if step_s <= 0 or net.control_step_s % step_s:
+        raise SettingError(f"setting 'step' is {step_s:g}: it must divide the control step of {net.control_step_s:g} s")
+
+
+def study_calibration(
+    base: dict[str, Any],
+    demands: Sequence[float],
+    seeds: Sequence[int],
+    folder: Path,
+    *,
+    tick: Callable[[], None],
+) -> dict[str, Any]:
+    """Record runs and fit the model to them: the content of a calibration file."""
+    items = [scenario(**base, demand=demand, seed=seed) for demand in demands for seed in seeds]
+    log = Log.stack([recording.read_log(path) for path in record(items, folder, tick)])
+    fitted = calibration.calibrate(network.load(base["net"]), log)
+    made = {"net": base["net"], "controller": items[0].controller, "demands": list(demands), "seeds": list(seeds)}
+    return {"made_from": {**made, "hours": items[0].hours}, **fitted}
