@@ -14,8 +14,9 @@ from utn_sumo.detectors import AREA_REACH_M
 
 FULL_SHARE = 0.8
 """Share of its storage from which the watched stretch counts as full, and the queue as reaching beyond it."""
-BLOCKED_SHARE = 0.5
-"""Share of its storage from which a source link may be turning traffic away: one lane can be full before the other."""
+BLOCKED_SHARE, SURELY_BLOCKED_SHARE = 0.5, 0.8
+"""Shares of its storage from which a source link may be, and surely is, turning traffic away: one lane can be full
+before the other. In between, that much of who was expected and did not come is taken to wait."""
 
 
 class CountingEstimator:
@@ -56,9 +57,12 @@ class CountingEstimator:
         self._q_veh = share * queue[network.turn_link]
 
         # Nobody waits outside a link with plenty of room; who was expected at another and did not enter, waits.
-        full = self._x_veh >= BLOCKED_SHARE * network.storage_veh
-        waiting = self._source_queue_veh + expected_veh - seen.entered_veh
-        self._source_queue_veh = np.where(network.is_source & full, np.maximum(waiting, 0.0), 0.0)
+        fullness = self._x_veh / network.storage_veh
+        sure = np.clip((fullness - BLOCKED_SHARE) / (SURELY_BLOCKED_SHARE - BLOCKED_SHARE), 0.0, 1.0)
+        missing = expected_veh - seen.entered_veh
+        waiting = self._source_queue_veh + np.where(missing > 0, sure * missing, missing)
+        blocked = network.is_source & (fullness >= BLOCKED_SHARE)
+        self._source_queue_veh = np.where(blocked, np.maximum(waiting, 0.0), 0.0)
         self._cycle += 1
         return self._state(seen.time_s, turned)
 

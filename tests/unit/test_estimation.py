@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from utn_sumo.contract import EXIT, Floats, Measurement, Network, State
-from utn_sumo.estimation import BLOCKED_SHARE, CountingEstimator
+from utn_sumo.estimation import SURELY_BLOCKED_SHARE, CountingEstimator
 
 SEEDS = st.integers(0, 2**32 - 1)
 WATCHED_M = 200
@@ -121,7 +121,7 @@ def test_who_was_served_is_no_longer_queued(utn17: Network) -> None:
 
 def test_expected_traffic_that_does_not_enter_a_full_source_link_waits_outside(utn17: Network) -> None:
     estimator = CountingEstimator(utn17)
-    x = np.ceil(BLOCKED_SHARE * utn17.storage_veh)
+    x = np.ceil(SURELY_BLOCKED_SHARE * utn17.storage_veh)
     expected = 15.0 * utn17.is_source
     first = estimator.update(counted(utn17, entered_veh=x, seen_veh=x), expected + x)
     assert first.source_queue_veh == pytest.approx(15 * utn17.is_source)
