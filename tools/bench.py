@@ -28,7 +28,7 @@ from rich.table import Table
 
 from utn_controllers.distributed_mpc import DistributedMPC
 from utn_controllers.distributed_mpc.whole import optimum
-from utn_sumo import bridge, network, recording, replay, sumo_tools
+from utn_sumo import bridge, calibration, network, recording, replay, sumo_tools
 from utn_sumo.contract import Forecast, Network, State
 from utn_sumo.scenario import scenario
 
@@ -103,7 +103,7 @@ def gap(net: str, hours: float, demand: float, seed: int, every: int, as_json: b
         lines = (folder / recording.CYCLES).read_text(encoding="utf-8").splitlines()
     states = [_state(json.loads(line)) for line in lines]
     rows = [
-        _gap_of(network.load(net), states, every, settings)
+        _gap_of(calibration.for_model(network.load(net), None), states, every, settings)
         for cost in ("tts", "paper")
         for settings in ({"cost": cost, "iterations": cap} for cap in (1, 5, 10, 20, 40, 80))
     ]
