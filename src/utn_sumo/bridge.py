@@ -41,7 +41,7 @@ def run(
     A KeyboardInterrupt ends the run early with a whole, readable result that says so. Raises UtnError.
     """
     net = network.load(scenario.net)
-    # Estimator, controller and model see the calibrated links; plant and demand are what they are.
+    # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.settings)
     step_s, duration_s = net.control_step_s, scenario.duration_s
@@ -61,7 +61,7 @@ def run(
     shutil.copyfile(net.net_file, folder / "net.net.xml")
     profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
     predictor = ProfileForecast(profile_veh_h * step_s / 3600)
-    estimator = CountingEstimator(known)
+    estimator = CountingEstimator(net)
     supervisor = Supervisor(net, controller)
     tally = _Tally()
     interrupted = False
