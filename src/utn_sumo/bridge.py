@@ -61,7 +61,7 @@ def run(
     shutil.copyfile(net.net_file, folder / "net.net.xml")
     profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
     predictor = ProfileForecast(profile_veh_h * step_s / 3600)
-    estimator = CountingEstimator(net)
+    estimator = CountingEstimator(net, known.delay_steps)
     supervisor = Supervisor(net, controller)
     tally = _Tally()
     interrupted = False

@@ -22,13 +22,14 @@ before the other. In between, that much of who was expected and did not come is 
 class CountingEstimator:
     """Counts vehicles in and out of every link."""
 
-    def __init__(self, network: Network):
+    def __init__(self, network: Network, history_steps: int | None = None):
+        """`history_steps` is how many past inflows the state is to hold; by default what the network's delays reach."""
         links = len(network.links)
         self.network = network
         self._x_veh = np.zeros(links)
         self._q_veh = np.zeros(len(network.turns))
         self._source_queue_veh = np.zeros(links)
-        self._past_inflow_veh = np.zeros((network.delay_steps, links))
+        self._past_inflow_veh = np.zeros((history_steps or network.delay_steps, links))
         length_m = np.array([link.length_m for link in network.links])
         self._watched_veh = network.storage_veh * np.minimum(1, AREA_REACH_M / length_m)
         self._cycle = 0
