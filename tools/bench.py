@@ -3,8 +3,10 @@
     python tools/bench.py overhead     control and bridge against the bare `sumo` binary on the same signals
     python tools/bench.py gap          the agents' plans against the same problem solved whole
     python tools/bench.py traffic      controllers against each other over demands and seeds
+    python tools/bench.py step         the model's step: what a finer one costs and brings, in prediction and in control
+    python tools/bench.py estimate     vehicles estimated from loops that miscount: counting against the filter
 
-Each prints a table, or with --json one object (traffic: a list of objects).
+Each prints a table, or with --json one object (all but overhead: a list of objects).
 """
 
 from __future__ import annotations
@@ -28,8 +30,11 @@ from rich.table import Table
 
 from utn_controllers.distributed_mpc import DistributedMPC
 from utn_controllers.distributed_mpc.whole import optimum
-from utn_sumo import bridge, calibration, network, recording, replay, sumo_tools
-from utn_sumo.contract import Forecast, Network, State
+from utn_sumo import bridge, calibration, mismatch, network, recording, replay, sumo_tools
+from utn_sumo.contract import Forecast, Measurement, Network, State
+from utn_sumo.detectors import Miscount
+from utn_sumo.estimation import Estimator
+from utn_sumo.recording import Log
 from utn_sumo.scenario import scenario
 
 
@@ -134,12 +139,13 @@ def _gap_of(net: Network, states: list[tuple[State, Forecast]], every: int, sett
     problems = [agent.problem for agent in controller.agents]
     gaps, iterations = [], []
     for step, (state, forecast) in enumerate(states):
+        timing = controller.timing()
         plan = controller.plan(state, forecast)
         iterations.append(plan.facts["iterations"])
         if step % every == 0:
             greens = np.vstack([plan.green_s, np.asarray(plan.ahead_s)])
-            least, _ = optimum(problems, state, forecast)
-            reached, _ = optimum(problems, state, forecast, greens)
+            least, _ = optimum(problems, state, forecast, timing)
+            reached, _ = optimum(problems, state, forecast, timing, greens)
             gaps.append(reached / least - 1)
     return {
         "cost": settings["cost"],
@@ -198,6 +204,105 @@ def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, 
         f"{net}, {hours:g} h, seeds {seeds}: time spent (veh h); alarms: unsafe s, fallbacks, teleports",
         ["demand", "controller", "by seed", "median", "ratio of medians", "by seed", "gridlocked", "alarms"],
         rows,
+    )
+
+
+@bench.command()
+@click.option("--net", default="utn17", show_default=True)
+@click.option("--hours", default=2.0, show_default=True)
+@click.option("--demand", default=1.3, show_default=True)
+@click.option("--seeds", default="1,2,3", show_default=True)
+@click.option("--steps", default="120,60,30", show_default=True, help="Model steps in seconds; 10 takes minutes a run.")
+@click.option("--json", "as_json", is_flag=True)
+def step(net: str, hours: float, demand: float, seeds: str, steps: str, as_json: bool) -> None:
+    """Control by `dmpc` with each model step: time spent, time a plan, and the same step's error in open loop."""
+    whole = network.load(net)
+    known = calibration.for_model(whole, None)
+    rows = []
+    for step_s in map(float, steps.split(",")):
+        with tempfile.TemporaryDirectory() as temporary:
+            results = [
+                bridge.run(
+                    scenario(net=net, hours=hours, demand=demand, seed=int(seed), settings={"step_s": step_s}),
+                    Path(temporary) / seed,
+                )
+                for seed in seeds.split(",")
+            ]
+            log = Log.stack([recording.read_log(Path(temporary) / seed) for seed in seeds.split(",")])
+        found = mismatch.errors(known, log, step_s, 7)
+        ratio = mismatch.summary(known, found, None)["rmse_over_persistence"]
+        spent = [result["total_time_spent_veh_h"] for result in results]
+        plans = hours * 3600 / whole.control_step_s
+        rows.append(
+            {
+                "step_s": step_s,
+                "total_time_spent_veh_h": spent,
+                "plan_s": statistics.median(result["control_time_s"] / plans for result in results),
+                "fallbacks": sum(result["fallbacks"] for result in results),
+                "rmse_over_persistence": ratio.tolist(),
+            }
+        )
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    _show(
+        f"{net}, dmpc, demand {demand:g}, {hours:g} h, seeds {seeds}: the model's step",
+        ["step s", "time spent veh h", "median", "ms a plan", "fallbacks", "RMSE/persistence 1 ahead", "7 ahead"],
+        [
+            [
+                f"{row['step_s']:g}",
+                " ".join(f"{value:.0f}" for value in row["total_time_spent_veh_h"]),
+                f"{statistics.median(row['total_time_spent_veh_h']):.0f}",
+                f"{1000 * row['plan_s']:.1f}",
+                str(row["fallbacks"]),
+                f"{row['rmse_over_persistence'][0]:.3f}",
+                f"{row['rmse_over_persistence'][-1]:.3f}",
+            ]
+            for row in rows
+        ],
+    )
+
+
+@bench.command()
+@click.option("--net", default="utn17", show_default=True)
+@click.option("--hours", default=2.0, show_default=True)
+@click.option("--demands", default="0.6,1.0,1.3", show_default=True)
+@click.option("--errors", default="0,0.01,0.03", show_default=True, help="Loop errors, as in utn run --loop-error.")
+@click.option("--seed", default=1, show_default=True)
+@click.option("--json", "as_json", is_flag=True)
+def estimate(net: str, hours: float, demands: str, errors: str, seed: int, as_json: bool) -> None:
+    """RMSE of x over links and cycles, from the same miscounting loops: by counting, and by the filter."""
+    whole = network.load(net)
+    known = calibration.for_model(whole, None)
+    rows = []
+    for demand in map(float, demands.split(",")):
+        with tempfile.TemporaryDirectory() as temporary:
+            bridge.run(scenario(net=net, hours=hours, demand=demand, seed=seed), Path(temporary) / "run")
+            lines = (Path(temporary) / "run" / recording.CYCLES).read_text(encoding="utf-8").splitlines()
+        records = [json.loads(line) for line in lines]
+        for error in map(float, errors.split(",")):
+            estimators = {"counting": Estimator(whole, known), "filter": Estimator(whole, known, error)}
+            miscount = Miscount(whole, error, seed)
+            squares: dict[str, list[float]] = {name: [] for name in estimators}
+            for record in records:
+                values: dict[str, Any] = {key: np.array(value) for key, value in record["seen"].items()}
+                seen = miscount.distort(Measurement(**values))
+                expected = np.array(record["forecast"]["demand_veh"][0])
+                for name, estimator in estimators.items():
+                    off = estimator.update(seen, expected).x_veh - np.array(record["truth"]["x_veh"])
+                    squares[name].append(float(np.mean(off**2)))
+            rmse = {name: math.sqrt(statistics.mean(each)) for name, each in squares.items()}
+            rows.append({"demand": demand, "loop_error": error, **{f"{k}_rmse_veh": v for k, v in rmse.items()}})
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    _show(
+        f"{net}, {hours:g} h, seed {seed}: RMSE of the estimated vehicles on a link",
+        ["demand", "loop error", "counting veh", "filter veh"],
+        [
+            [f"{r['demand']:g}", f"{r['loop_error']:g}", f"{r['counting_rmse_veh']:.2f}", f"{r['filter_rmse_veh']:.2f}"]
+            for r in rows
+        ],
     )
 
 

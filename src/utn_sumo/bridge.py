@@ -16,7 +16,8 @@ import numpy as np
 import utn_sumo
 from utn_sumo import calibration, controllers, demand, metrics, monitor, network, recording
 from utn_sumo.contract import Floats
-from utn_sumo.estimation import CountingEstimator
+from utn_sumo.detectors import Miscount
+from utn_sumo.estimation import Estimator
 from utn_sumo.plant.sumo import SumoPlant
 from utn_sumo.prediction import ProfileForecast
 from utn_sumo.scenario import Scenario
@@ -61,7 +62,8 @@ def run(
     shutil.copyfile(net.net_file, folder / "net.net.xml")
     profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
     predictor = ProfileForecast(profile_veh_h * step_s / 3600)
-    estimator = CountingEstimator(net, known.delay_steps)
+    estimator = Estimator(net, known, scenario.loop_error)
+    miscount = Miscount(net, scenario.loop_error, scenario.seed)
     supervisor = Supervisor(net, controller)
     tally = _Tally()
     interrupted = False
@@ -75,7 +77,7 @@ def run(
             for step in range(steps):
                 ahead = predictor.forecast(step, controller.horizon)
                 decision = supervisor.ask(state, ahead)
-                seen = plant.run(decision.plan)
+                seen = miscount.distort(plant.run(decision.plan))
                 recorder.write(
                     {
                         "cycle": step,

@@ -1,7 +1,7 @@
-"""Link parameters from recorded runs: least squares on the model's one-step prediction error.
+"""Link parameters from recorded runs: least squares on the model's prediction error, one and several steps ahead.
 
-Fitted by link: saturation flow, storage (which is the queue's spacing), free speed; for the network: the start-up lag;
-and turning fractions from the turn loops. Each comes with its standard error. A calibration is a JSON file beside the
+Fitted by link: saturation flow, storage, queue spacing, free speed; for the network: the start-up lag; and turning
+fractions from the turn loops. Each comes with its standard error. A calibration is a JSON file beside the
 net, or named in a scenario; the demand and the plant never see it, only the model does.
 """
 
@@ -19,22 +19,28 @@ from utn_sumo.contract import Floats, Network
 from utn_sumo.errors import NetworkError
 from utn_sumo.model import LinkModel
 from utn_sumo.recording import Log
-from utn_sumo.rollout import known_demand_veh, observe, roll
+from utn_sumo.rollout import known_demand_veh, known_source_queue_veh, predict, starts
 
 STEP_S = 10.0
-"""Model step on which the parameters are fitted: the paper's sampling interval."""
+"""The paper's sampling interval."""
 ERROR_VEH = 4.0
 """Size of a one-step error, against which a parameter's distance from its prior weighs."""
-PRIOR_SHARE = 0.2
-"""Standard deviation of a parameter about its prior, relative: a link that never saturates keeps its flow."""
+FITTED = {"saturation_flow_veh_s": 0.2, "storage_veh": 0.1, "queue_spacing_m": 0.1, "free_speed_m_s": 0.2}
+"""Parameters of a link, and their relative standard deviation about what the network's links have in common: a link
+that never saturates or fills is taken to be like the others. The road's length settles most of the storage."""
+COMMON_SHARE = 0.3
+"""Standard deviation of what the links have in common about what the net says, relative."""
 LAG_PRIOR_S = 2.0
 EVALUATIONS = 8
-FITTED = ("saturation_flow_veh_s", "storage_veh", "free_speed_m_s")
+HORIZON = 4
+FITTED_AHEAD = (0, HORIZON - 1)
+"""Control steps ahead whose errors are fitted: one step alone would let a parameter be right first and wrong later."""
 
 
-def calibrate(network: Network, log: Log) -> dict[str, Any]:
+def calibrate(network: Network, log: Log, step_s: float = STEP_S) -> dict[str, Any]:
     """Fit `network` to the runs of the log and return the calibration as it goes into its file.
 
+    `step_s` is the model's step with which it is fitted; the parameters suit that step best.
     `one_step_rmse_veh` is the error that is left in each of the runs, in their order.
     """
     from scipy.optimize import least_squares  # noqa: PLC0415 - heavy
@@ -43,24 +49,29 @@ def calibrate(network: Network, log: Log) -> dict[str, Any]:
     with_turns = _with_fractions(network, fractions)
     size = len(FITTED) * len(network.links)
     start = np.append(np.ones(size), network.startup_lag_s)
-    demand = known_demand_veh(network, log)
+    spread = np.array(list(FITTED.values()))[:, None]
+    demand, waiting, first = known_demand_veh(network, log), known_source_queue_veh(log), starts(log, HORIZON)
 
     def residual(parameters: Floats) -> Floats:
-        model = LinkModel(_scaled(with_turns, parameters), STEP_S)
-        prediction = roll(model, log, observe(model, log), demand, 1)
-        error = prediction.x_veh[0] - log.true_x_veh[prediction.starts]
-        prior = np.append((parameters[:-1] - 1) / PRIOR_SHARE, (parameters[-1] - start[-1]) / LAG_PRIOR_S)
-        return np.concatenate([error.ravel() / ERROR_VEH, prior])
+        model = LinkModel(_scaled(with_turns, parameters), step_s)
+        turning = np.array([log.fraction[first]] * HORIZON)
+        prediction = predict(model, log, HORIZON, demand_veh=demand, source_queue_veh=waiting, fraction=turning)
+        error = np.array([prediction.x_veh[ahead] - log.true_x_veh[first + ahead] for ahead in FITTED_AHEAD])
+        factors = parameters[:-1].reshape(len(FITTED), -1)
+        common = factors.mean(axis=1, keepdims=True)
+        alone, together = (factors - common) / spread, (common - 1) / COMMON_SHARE
+        lag = (parameters[-1:] - start[-1]) / LAG_PRIOR_S
+        return np.concatenate([error.ravel() / ERROR_VEH, alone.ravel(), together.ravel(), lag])
 
     fit = least_squares(
         residual,
         start,
-        bounds=(np.append(np.full(size, 0.4), 0.0), np.append(np.full(size, 2.0), 10.0)),
+        bounds=(np.append(np.full(size, 0.2), 0.0), np.append(np.full(size, 2.0), 10.0)),
         diff_step=0.02,
         x_scale=np.append(np.full(size, 0.1), 1.0),
         max_nfev=EVALUATIONS,
     )
-    error = fit.fun[: log.x_veh[0].size * (len(log.x_veh) - 1)].reshape(-1, *log.x_veh.shape[1:]) * ERROR_VEH
+    error = fit.fun[: len(first) * log.x_veh[0].size].reshape(-1, *log.x_veh.shape[1:]) * ERROR_VEH
     scale = 2 * fit.cost / max(len(fit.fun) - len(fit.x), 1)
     sd = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * scale)
     content = _content(_scaled(with_turns, fit.x), fit.x, sd, fraction_sd)

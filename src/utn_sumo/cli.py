@@ -28,6 +28,7 @@ def cli() -> None:
 @click.option("--profile", help="Demand profile: peak, paper or constant.  [peak]")
 @click.option("--noise", help="Relative standard deviation of correlated demand noise.  [0]")
 @click.option("--seed", help="Seed of demand and SUMO.  [1]")
+@click.option("--loop-error", help="Share of vehicles by which loops miscount, its spread over the loops.  [0]")
 @click.option("--calibration", help="Calibration file for the model, or none.  [the one beside the net]")
 @click.option("--horizon", help="Prediction horizon Kp of a predictive controller, in cycles.  [7]")
 @click.option("--control-horizon", help="Control horizon Kc, in cycles.  [4]")
@@ -66,6 +67,7 @@ def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bo
 @click.option("--horizon", default="7", show_default=True, help="Control steps ahead.")
 @click.option("--step", default="10", show_default=True, help="The model's step in seconds; 120 is the whole cycle.")
 @click.option("--inputs", default="known", show_default=True, help="Demand of the predictions: known or forecast.")
+@click.option("--turning", default="forecast", show_default=True, help="Turning fractions: known or forecast.")
 @click.option("--calibration", help="Calibration file, or none.  [the one beside the net]")
 @click.option("--floor/--no-floor", "with_floor", default=True, help="Measure the spread of SUMO itself too.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
@@ -88,6 +90,7 @@ def mismatch(out: Path | None, with_floor: bool, as_json: bool, demand: str, **f
             step_s=step_s,
             horizon=horizon,
             inputs=flags["inputs"],
+            turning=flags["turning"],
             with_floor=with_floor,
             tick=tick,
         )
@@ -101,10 +104,11 @@ def mismatch(out: Path | None, with_floor: bool, as_json: bool, demand: str, **f
 @click.option("--demand", default="0.7,0.9,1.1,1.25", show_default=True, help="Demands, separated by commas.")
 @click.option("--seeds", default="201,202", show_default=True, help="Seeds, separated by commas.")
 @click.option("--hours", default="2", show_default=True)
+@click.option("--step", default="10", show_default=True, help="The model's step in seconds; 120 is the whole cycle.")
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder for the runs; must be new or empty."
 )
-def calibrate(out: Path, demand: str, seeds: str, **flags: Any) -> None:
+def calibrate(out: Path, demand: str, seeds: str, step: str, **flags: Any) -> None:
     """Fit the model to recorded runs and write its parameters with their standard errors."""
     from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
 
@@ -112,7 +116,7 @@ def calibrate(out: Path, demand: str, seeds: str, **flags: Any) -> None:
     base = {**flags, "calibration": "none"}
     folder = recording.new_folder(out, "calibration")
     with report.counter("runs", len(demands) * len(seed_list)) as tick:
-        content = study.study_calibration(base, demands, seed_list, folder, tick=tick)
+        content = study.study_calibration(base, demands, seed_list, folder, step_s=_numbers("step", step)[0], tick=tick)
     path = folder / "calibration.json"
     recording.write_json(path, content)
     report.calibration_table(content)

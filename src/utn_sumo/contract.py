@@ -22,6 +22,8 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 EXIT = -1
+SAMPLE_S = 10.0
+"""Longest time between two readings of the entry loops (the paper's sampling interval)."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ class Link:
     length_m: float
     free_speed_m_s: float
     storage_veh: float
+    queue_spacing_m: float
+    """Length of the link that one more queued vehicle takes up, on all its lanes together (l_veh / N_lane)."""
     saturation_flow_veh_s: float
     """Of all its lanes together (mu_z)."""
     is_source: bool
@@ -158,6 +162,11 @@ class Network:
         return np.array([link.length_m / link.free_speed_m_s for link in self.links])
 
     @cached_property
+    def queue_spacing_s_veh(self) -> Floats:
+        """(Z,) by how much a queued vehicle shortens the way to the queue's tail, in time."""
+        return np.array([link.queue_spacing_m / link.free_speed_m_s for link in self.links])
+
+    @cached_property
     def min_green_s(self) -> Floats:
         """(S,) shortest green of each stage."""
         return np.array([self.junctions[stage.junction].min_green_s for stage in self.stages])
@@ -175,14 +184,24 @@ class Network:
         )
 
     @cached_property
-    def delay_steps(self) -> int:
-        """Control steps that the longest free-flow delay reaches back to: the H of State.past_inflow_veh."""
-        return 1 + int(np.ceil(self.free_time_s.max() / self.control_step_s))
+    def delay_samples(self) -> int:
+        """Samples that the longest free-flow delay reaches back to: the H of State.past_inflow_veh."""
+        return 1 + int(np.ceil(self.free_time_s.max() / self.sample_s))
 
     @property
     def control_step_s(self) -> float:
         """Time between two decisions: the least common multiple of the cycles (SPEC 2.7, N = 1)."""
         return float(np.lcm.reduce(self.cycle_s.astype(np.int64)))
+
+    @property
+    def samples(self) -> int:
+        """Samples that a control step is divided into (P)."""
+        return int(np.ceil(self.control_step_s / SAMPLE_S))
+
+    @property
+    def sample_s(self) -> float:
+        """Length of a sample, in which the entry loops are counted."""
+        return self.control_step_s / self.samples
 
     def part(self, junction: int) -> Network:
         """The network of one junction alone: its incoming links, their turns, its stages.
@@ -247,7 +266,7 @@ class Measurement:
     time_s: float
     """End of the step."""
     entered_veh: Floats
-    """(Z,) over the loops at the link's entry."""
+    """(P, Z) over the loops at the link's entry, by sample, in the order of time."""
     turned_veh: Floats
     """(M,) over the loops just behind the stop line, where the turns part."""
     queue_veh: Floats
@@ -273,9 +292,11 @@ class State:
     source_queue_veh: Floats
     """(Z,) vehicles that wait outside a source link for room to enter."""
     past_inflow_veh: Floats
-    """(H, Z) vehicles that entered in each of the last steps, newest first (f_in(k-1) c, ...)."""
+    """(H, Z) vehicles that entered in each of the last samples, newest first (f_in as in SPEC 2.5, finer)."""
     turned_veh: Floats
     """(M,) vehicles that made each turn in the last step; their sum over a link is what left it."""
+    fraction: Floats
+    """(M,) turning fractions as they are at present; they sum to 1 over a link."""
 
 
 @dataclass(frozen=True)

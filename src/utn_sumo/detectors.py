@@ -9,11 +9,13 @@ counts, never sums of steps (SPEC 6).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from utn_sumo.contract import Link, Network
+import numpy as np
+
+from utn_sumo.contract import Floats, Link, Measurement, Network
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -92,3 +94,29 @@ def write(network: Network, path: Path, period_s: float) -> None:
             loop(f"turn_{via}", via, TURN_M)
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+
+
+class Miscount:
+    """Loops as they are on the street: each misses a share of its vehicles, or counts a share twice.
+
+    The share is a loop's own for the whole run, normal about 0 with the standard deviation `loop_error`.
+    """
+
+    def __init__(self, network: Network, loop_error: float, seed: int):
+        self._rng = np.random.default_rng([seed, 0x3D])
+        self._exact = loop_error == 0
+        self._entry = loop_error * self._rng.standard_normal(len(network.links))
+        self._turn = loop_error * self._rng.standard_normal(len(network.turns))
+
+    def distort(self, seen: Measurement) -> Measurement:
+        """The measurement as such loops would have it."""
+        if self._exact:
+            return seen
+        entered, turned = self._count(seen.entered_veh, self._entry), self._count(seen.turned_veh, self._turn)
+        return replace(seen, entered_veh=entered, turned_veh=turned)
+
+    def _count(self, veh: Floats, share: Floats) -> Floats:
+        wrong = self._rng.binomial(
+            np.round(veh).astype(np.int64), np.broadcast_to(np.minimum(np.abs(share), 1), veh.shape)
+        )
+        return np.asarray(veh + np.sign(share) * wrong)

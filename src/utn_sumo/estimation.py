@@ -1,8 +1,10 @@
-"""Detector counts to the state vector: vehicles, queues, source queues, turning counts, all in veh.
+"""Detector counts to the state vector: vehicles, queues, source queues and turning, all in veh.
 
-x is counted in at the entry loops and out at the turn loops, so that it is conserved from link to link; the
-lane-area detectors bound it, so that a miscount can't live on for ever. q comes from the lane-area detectors,
-and its split by turn from who came and who went.
+x is counted in at the entry loops and out at the turn loops, so that it is conserved from link to link. Loops miscount,
+and a count that is summed up never forgets; so a Kalman filter by link holds the count against what can be seen: where
+no queue stands, the vehicles in view of the lane-area detectors and those that entered too short ago to be in view are
+all there are. Its second state is by how much the link's loops differ, which is what makes a count drift.
+q comes from the lane-area detectors, and its split by turn from who came and who went.
 """
 
 from __future__ import annotations
@@ -14,24 +16,55 @@ from utn_sumo.detectors import AREA_REACH_M
 
 FULL_SHARE = 0.8
 """Share of its storage from which the watched stretch counts as full, and the queue as reaching beyond it."""
-BLOCKED_SHARE, SURELY_BLOCKED_SHARE = 0.5, 0.8
-"""Shares of its storage from which a source link may be, and surely is, turning traffic away: one lane can be full
-before the other. In between, that much of who was expected and did not come is taken to wait."""
+QUIET_SHARE = 0.3
+"""Share of its storage up to which the watched stretch leaves the vehicles before it moving freely."""
+BIAS_STEP_SHARE = 0.01
+"""By how much of the loops' error a link's loops may come to differ in a step."""
+SEEN_SD_VEH, SEEN_SD_SHARE = 1.0, 0.1
+"""Standard deviation of what can be seen: of all, and of the share that is not in view."""
+FREE_SHARE = 0.4
+"""Share of its storage up to which a source link is surely not turning traffic away."""
+SLOW, BLOCKED = 1.3, 1.5
+"""Time that a vehicle covers the entry loops, against free traffic, from which some may be, and all are, kept out."""
+SHUT_SD = 2.0
+"""So many standard deviations too few entering a link that is not free: those who came have to wait."""
+TURN_MEMORY_STEPS = 30.0
+"""Control steps after which what was seen turning weighs 1/e."""
+TURN_PRIOR_VEH = 200.0
+"""Vehicles that the known turning fractions are worth."""
 
 
-class CountingEstimator:
-    """Counts vehicles in and out of every link."""
+class Estimator:
+    """Follows one plant through its detectors."""
 
-    def __init__(self, network: Network, history_steps: int | None = None):
-        """`history_steps` is how many past inflows the state is to hold; by default what the network's delays reach."""
-        links = len(network.links)
+    def __init__(self, network: Network, known: Network, loop_error: float = 0.0):
+        """`network` is the road as it is, `known` the same as the controllers know it: its delays and turning.
+
+        `loop_error` is by how much loops miscount, as in `detectors.Miscount`; at 0 they are believed.
+        """
+        links, turns = len(network.links), len(network.turns)
         self.network = network
+        self.known = known
         self._x_veh = np.zeros(links)
-        self._q_veh = np.zeros(len(network.turns))
+        self._bias = np.zeros(links)
+        """(Z,) how much more the exit loops count than the entry loops, relative."""
+        self._covariance = np.zeros((links, 2, 2))
+        self._covariance[:, 1, 1] = 2 * loop_error**2
+        # A loop that misses a share p at random adds p (1 - p) to the variance for each vehicle; p is normal.
+        self._count_variance = np.sqrt(2 / np.pi) * loop_error
+        self._bias_step_variance = (BIAS_STEP_SHARE * loop_error) ** 2
+        self._q_veh = np.zeros(turns)
         self._source_queue_veh = np.zeros(links)
-        self._past_inflow_veh = np.zeros((history_steps or network.delay_steps, links))
+        self._past_inflow_veh = np.zeros((known.delay_samples, links))
+        self._turning_veh = TURN_PRIOR_VEH * known.fraction
         length_m = np.array([link.length_m for link in network.links])
+        speed_m_s = np.array([link.free_speed_m_s for link in known.links])
         self._watched_veh = network.storage_veh * np.minimum(1, AREA_REACH_M / length_m)
+        hidden_samples = np.maximum(length_m - AREA_REACH_M, 0) / speed_m_s / network.sample_s
+        self._hidden = np.clip(hidden_samples - np.arange(known.delay_samples)[:, None], 0.0, 1.0)
+        """(H, Z) share of each past sample's inflow that has not come into view, on a free road."""
+        self._free_cover_s = np.full(links, np.nan)
+        """(Z,) time that a vehicle covers the loops at a source's entry when nothing holds it up."""
         self._cycle = 0
 
     def initial(self) -> State:
@@ -40,37 +73,74 @@ class CountingEstimator:
 
     def update(self, seen: Measurement, expected_veh: Floats) -> State:
         """The state after one more control step. `expected_veh` (Z,) is the demand forecast for that step."""
-        network = self.network
-        unwatched_veh = network.storage_veh - self._watched_veh
-        turned = seen.turned_veh
-        counted = self._x_veh + seen.entered_veh - self._by_link(turned)
-        # What the lane-area detectors see is there; what they don't see must fit on the rest of the road.
-        self._x_veh = np.clip(counted, seen.seen_veh, seen.seen_veh + unwatched_veh)
-        self._past_inflow_veh = np.vstack([seen.entered_veh, self._past_inflow_veh[:-1]])
-
-        queue = self._queue(seen)
-        # Who is queued for which turn: what was queued and came less what went, brought to the queue's measure.
-        before = self._by_link(self._q_veh)
-        arrived = np.maximum(queue - before + self._by_link(turned), 0.0)
-        split = np.maximum(self._q_veh + network.fraction * arrived[network.turn_link] - turned, 0.0)
-        total = self._by_link(split)[network.turn_link]
-        share = np.where(total > 0, split / np.maximum(total, 1e-9), network.fraction)
-        self._q_veh = share * queue[network.turn_link]
-
-        # Nobody waits outside a link with plenty of room; who was expected at another and did not enter, waits.
-        fullness = self._x_veh / network.storage_veh
-        sure = np.clip((fullness - BLOCKED_SHARE) / (SURELY_BLOCKED_SHARE - BLOCKED_SHARE), 0.0, 1.0)
-        missing = expected_veh - seen.entered_veh
-        waiting = self._source_queue_veh + np.where(missing > 0, sure * missing, missing)
-        blocked = network.is_source & (fullness >= BLOCKED_SHARE)
-        self._source_queue_veh = np.where(blocked, np.maximum(waiting, 0.0), 0.0)
+        entered = seen.entered_veh.sum(axis=0)
+        newest_first = np.vstack([seen.entered_veh[::-1], self._past_inflow_veh])
+        self._past_inflow_veh = newest_first[: len(self._past_inflow_veh)]
+        self._count(seen, entered)
+        self._queue(seen)
+        self._turn(seen.turned_veh)
+        self._wait_outside(seen, entered, expected_veh)
         self._cycle += 1
-        return self._state(seen.time_s, turned)
+        return self._state(seen.time_s, seen.turned_veh)
 
-    def _queue(self, seen: Measurement) -> Floats:
-        """(Z,) queued vehicles: standing in view, and all beyond the view where the view stands full."""
+    def _count(self, seen: Measurement, entered_veh: Floats) -> None:
+        """X by the Kalman filter: counted on, and held against what is seen where the road is free."""
+        left = self._by_link(seen.turned_veh)
+        x = self._x_veh + entered_veh - (1 - self._bias) * left
+        move = np.zeros_like(self._covariance)
+        move[:, 0, 0] = move[:, 1, 1] = 1.0
+        move[:, 0, 1] = left
+        covariance = move @ self._covariance @ move.transpose(0, 2, 1)
+        covariance[:, 0, 0] += self._count_variance * (entered_veh + left)
+        covariance[:, 1, 1] += self._bias_step_variance
+
+        hidden = (self._hidden * self._past_inflow_veh).sum(axis=0)
+        quiet = seen.seen_veh <= QUIET_SHARE * self._watched_veh
+        variance = SEEN_SD_VEH**2 + (SEEN_SD_SHARE * hidden) ** 2
+        gain = quiet[:, None] * covariance[:, :, 0] / (covariance[:, 0, 0] + variance)[:, None]
+        residual = seen.seen_veh + hidden - x
+        self._covariance = covariance - gain[:, :, None] * covariance[:, None, 0, :]
+        self._bias = self._bias + gain[:, 1] * residual
+        # What the lane-area detectors see is there; what they don't see must fit on the rest of the road.
+        unwatched_veh = self.network.storage_veh - self._watched_veh
+        self._x_veh = np.clip(x + gain[:, 0] * residual, seen.seen_veh, seen.seen_veh + unwatched_veh)
+
+    def _queue(self, seen: Measurement) -> None:
+        """q: standing in view, and all beyond the view where the view stands full; by turn as they came and went."""
         beyond = np.where(seen.queue_veh >= FULL_SHARE * self._watched_veh, self._x_veh - seen.seen_veh, 0.0)
-        return np.minimum(seen.queue_veh + beyond, self._x_veh)
+        queue = np.minimum(seen.queue_veh + beyond, self._x_veh)
+        fraction, link = self._fraction(), self.network.turn_link
+        arrived = np.maximum(queue - self._by_link(self._q_veh) + self._by_link(seen.turned_veh), 0.0)
+        split = np.maximum(self._q_veh + fraction * arrived[link] - seen.turned_veh, 0.0)
+        total = self._by_link(split)[link]
+        self._q_veh = np.where(total > 0, split / np.maximum(total, 1e-9), fraction) * queue[link]
+
+    def _turn(self, turned_veh: Floats) -> None:
+        """Turning fractions: what was known, worth so many vehicles, and what was seen, slowly forgotten."""
+        prior = TURN_PRIOR_VEH * self.known.fraction
+        self._turning_veh = prior + (self._turning_veh - prior) * np.exp(-1 / TURN_MEMORY_STEPS) + turned_veh
+
+    def _fraction(self) -> Floats:
+        return np.asarray(self._turning_veh / self._by_link(self._turning_veh)[self.network.turn_link])
+
+    def _wait_outside(self, seen: Measurement, entered_veh: Floats, expected_veh: Floats) -> None:
+        """Who was expected at a source and did not enter waits, if the entry loops show that the way in was blocked."""
+        network = self.network
+        lanes = np.array([network.edge_lanes[link.edges[0]] for link in network.links])
+        covered_s = seen.entry_occupancy * lanes * network.control_step_s
+        cover_s = covered_s / np.maximum(entered_veh, 1.0)
+        free = self._x_veh <= FREE_SHARE * network.storage_veh
+        with_traffic = free & (entered_veh > 0)
+        before = np.where(np.isnan(self._free_cover_s), cover_s, self._free_cover_s)
+        self._free_cover_s = np.where(with_traffic, before + 0.1 * (cover_s - before), self._free_cover_s)
+        known = self._free_cover_s > 0
+        slowed = np.divide(cover_s, self._free_cover_s, out=np.ones_like(cover_s), where=known)
+        blocked = np.clip((slowed - SLOW) / (BLOCKED - SLOW), 0.0, 1.0)
+        missing = expected_veh - entered_veh
+        shut = ~free & (missing > SHUT_SD * np.sqrt(expected_veh))
+        kept_out = np.where(shut, 1.0, blocked)
+        waiting = self._source_queue_veh + np.where(missing > 0, kept_out * missing, missing)
+        self._source_queue_veh = np.where(network.is_source & (kept_out > 0), np.maximum(waiting, 0.0), 0.0)
 
     def _by_link(self, by_turn: Floats) -> Floats:
         return np.asarray(np.bincount(self.network.turn_link, by_turn, minlength=len(self.network.links)), dtype=float)
@@ -84,4 +154,5 @@ class CountingEstimator:
             source_queue_veh=self._source_queue_veh.copy(),
             past_inflow_veh=self._past_inflow_veh.copy(),
             turned_veh=turned_veh,
+            fraction=self._fraction(),
         )

@@ -2,10 +2,11 @@
 
 A recorded run is replayed to a cut: the same seed, routes and signals give the same history, bit for bit. From there on
 the future is drawn anew: every vehicle that departs later gets a new way and a new moment within its control step,
-every vehicle on the road a new way after its next junction (the lane that it drives in has settled the turn there), and
-a speed factor moved by one per cent, which sets SUMO's own random streams apart within seconds. The standard deviation
-of x over such replicas is the error of the best predictor that knows all of the history, the greens to come and how
-many will arrive in each control step, but nobody's mind.
+every vehicle on the road a new way from its next junction on (from the one after it if it is within the reach of the
+lane-area detectors: the lane that it is in has settled the turn there), and a speed factor moved by one per cent, which
+sets SUMO's own random streams apart within seconds. The standard deviation of x over such replicas is the error of the
+best predictor that knows all of the history, every vehicle's place and speed, the greens to come and how many will
+arrive in each control step, but nobody's mind.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import numpy as np
 from utn_sumo.contract import Floats, Network
 from utn_sumo.model import LinkModel
 from utn_sumo.recording import Log
-from utn_sumo.rollout import known_demand_veh, observe, roll
+from utn_sumo.rollout import known_demand_veh, known_fraction, known_source_queue_veh, predict, starts
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,22 @@ class Errors:
     """(Z,) mean true x, by which errors are normalised."""
 
 
-def errors(network: Network, log: Log, step_s: float, horizon: int, inputs: str) -> Errors:
+def errors(
+    network: Network, log: Log, step_s: float, horizon: int, *, known_demand: bool = True, known_turning: bool = False
+) -> Errors:
     """Errors of the model with a step of `step_s`, over all the runs of one demand.
 
-    `inputs` is `known` (who wanted to enter is known, turning is not) or `forecast` (nor is that).
+    With `known_demand` the model is told who will want to enter and who waits outside; without, it has the forecast and
+    the estimate. With `known_turning` it is told how the traffic will turn in each step ahead.
     """
     model = LinkModel(network, step_s)
-    demand = known_demand_veh(network, log) if inputs == "known" else log.forecast_veh
-    prediction = roll(model, log, observe(model, log), demand, horizon)
-    at = prediction.starts + np.arange(horizon)[:, None]
+    demand, waiting = log.forecast_veh, log.source_queue_veh
+    if known_demand:
+        demand, waiting = known_demand_veh(network, log), known_source_queue_veh(log)
+    first = starts(log, horizon)
+    at = first + np.arange(horizon)[:, None]
+    fraction = known_fraction(network, log)[at] if known_turning else np.array([log.fraction[first]] * horizon)
+    prediction = predict(model, log, horizon, demand_veh=demand, source_queue_veh=waiting, fraction=fraction)
     true_x = log.true_x_veh[at]
     runs = true_x.shape[2]
     history = (log.true_x_veh.sum(axis=1, keepdims=True) - log.true_x_veh) / max(runs - 1, 1)
@@ -55,7 +62,7 @@ def errors(network: Network, log: Log, step_s: float, horizon: int, inputs: str)
         x_veh=cases(prediction.x_veh - true_x),
         queue_veh=cases(prediction.queue_veh - log.true_queue_veh[at]),
         inflow_veh=cases(prediction.inflow_veh - log.entered_veh[at]),
-        persistence_veh=cases(log.x_veh[prediction.starts] - true_x),
+        persistence_veh=cases(log.x_veh[first] - true_x),
         history_veh=cases(history[at] - true_x) if runs > 1 else None,
         measured_veh=cases(true_x),
         scale_veh=log.true_x_veh.mean(axis=(0, 1)),

@@ -16,7 +16,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from utn_sumo.contract import EXIT, Floats, Network
+from utn_sumo.contract import EXIT, SAMPLE_S, Floats, Network
+from utn_sumo.errors import SettingError
 
 
 class Operations(Protocol):
@@ -81,7 +82,7 @@ class ModelState:
     source_queue_veh: Any
     """(Z,) vehicles that wait outside a source link."""
     past_inflow_veh: tuple[Any, ...]
-    """Inflow (Z,) of the last steps, newest first."""
+    """Inflow (Z,) of the last samples, newest first: `LinkModel.lags` of `LinkModel.sample_s` each."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,7 @@ class StepFlows:
 
 WAVE_SPEED_M_S = 6.0
 """Speed at which a queue's start-up travels upstream: a standing vehicle's 7.5 m in about 1.3 s."""
+STEP_TOLERANCE = 1e-9
 INFINITE_ROOM_VEH = 1e9
 """Room beyond an exit: the third term of SPEC 2.3 does not bind there."""
 
@@ -121,11 +123,13 @@ class LinkModel:
         self._is_source = network.is_source.astype(float)
         self._saturation_veh_s = network.saturation_flow_veh_s[network.turn_link]
         # Room that opens at the stop line reaches the entry as a wave: within one step, only so much of it does.
-        wave_s = np.array([link.length_m for link in network.links]) / WAVE_SPEED_M_S
-        self._room_share = np.minimum(1.0, step_s / wave_s)
-        self._space_s_veh = network.free_time_s / network.storage_veh
-        self.lags = 1 + int(np.ceil(network.free_time_s.max() / step_s))
-        """Past inflows that the delay reaches back to."""
+        self._wave_s = np.array([link.length_m for link in network.links]) / WAVE_SPEED_M_S
+        self._room_share = np.minimum(1.0, step_s / self._wave_s)
+        self.samples = int(np.ceil(step_s / SAMPLE_S))
+        """Samples of a step, in which the past is remembered: a long step looks back as sharply as the loops count."""
+        self.sample_s = step_s / self.samples
+        self.lags = max(self.samples, int(np.ceil(network.free_time_s.max() / self.sample_s)))
+        """Past samples that the delay reaches back to."""
         self.sweeps = self._sweeps_needed()
 
     def _sweeps_needed(self) -> int:
@@ -142,25 +146,47 @@ class LinkModel:
 
     def delay_s(self, queue_veh: Any) -> Any:
         """(Z,) time from entry to the tail of the queue (SPEC 2.6), never negative."""
-        free_veh = self.operations.maximum(self.network.storage_veh - queue_veh, 0.0)
-        return free_veh * self._space_s_veh
+        free_s = self.network.free_time_s - queue_veh * self.network.queue_spacing_s_veh
+        return self.operations.maximum(free_s, 0.0)
 
-    def on_the_way(self, delay_s: Any) -> list[Any]:
-        """Share (Z,) of the inflow of each lag 0, 1, ... that is still on its way after `delay_s`."""
-        steps = delay_s / self.step_s
-        clip = self.operations
-        return [clip.minimum(clip.maximum(steps - lag, 0.0), 1.0) for lag in range(self.lags)]
+    def on_the_way(self, delay_s: Any, at_s: Any | None = None) -> list[Any]:
+        """Share of the step's own inflow, then of each past sample's, that is still to arrive `at_s` into the step.
+
+        By link or by turn, as `delay_s` and `at_s` are; without `at_s` at the step's end. Within a step and within a
+        sample the inflow is even.
+        """
+        ops = self.operations
+        # Who entered less than this long before the step's start is still on the way.
+        since = delay_s - (self.step_s if at_s is None else at_s)
+
+        def within(share: Any) -> Any:
+            return ops.minimum(ops.maximum(share, 0.0), 1.0)
+
+        past = [within(since / self.sample_s - lag) for lag in range(self.lags)]
+        return [within(since / self.step_s + 1.0), *past]
+
+    def history(self, counted_veh: Floats, sample_s: float) -> tuple[Floats, ...]:
+        """Past inflows as the model remembers them, from counts (..., H, Z) in samples of `sample_s`, newest first."""
+        known = counted_veh.shape[-2]
+        summed = np.concatenate([np.zeros_like(counted_veh[..., :1, :]), np.cumsum(counted_veh, axis=-2)], axis=-2)
+        at = np.clip(np.arange(self.lags + 1) * self.sample_s / sample_s, 0, known)
+        low = np.minimum(at.astype(np.int64), known - 1)
+        part = (at - low)[:, None]
+        curve = summed[..., low, :] * (1 - part) + summed[..., low + 1, :] * part
+        return tuple(np.moveaxis(np.diff(curve, axis=-2), -2, 0))
 
     def arriving_veh(self, moving_veh: Any, inflow_veh: Any, past: Sequence[Any], share: Sequence[Any]) -> Any:
-        """(Z,) vehicles that reach the tail of the queue in a step (SPEC 2.5 as cumulative curves).
+        """Vehicles that reach the tail of the queue by the time of `share` (SPEC 2.5 as cumulative curves).
+
+        All by link, or all by turn with each link's numbers at its turns.
 
         Who is on the link and not queued, or comes in now, arrives unless it entered less than the delay
         ago. For a constant delay this is SPEC 2.5 exactly; for a varying one it conserves vehicles,
         and nobody arrives twice or never. It may be negative only where the delay has just grown.
         """
         still = share[0] * inflow_veh
-        for lag in range(1, self.lags):
-            still = still + share[lag] * past[lag - 1]
+        for inflow_then, share_then in zip(past, share[1:], strict=False):
+            still = still + share_then * inflow_then
         return moving_veh + inflow_veh - still
 
     def saturated_veh(self, green_s: Any, fraction: Any) -> Any:
@@ -168,70 +194,119 @@ class LinkModel:
         return fraction * self._saturation_veh_s * green_s
 
     def room_veh(self, x_veh: Any) -> Any:
-        """(Z,) vehicles that a link still takes: C - x, the third term of SPEC 2.3 before it is shared out."""
-        return self.network.storage_veh - x_veh
+        """(Z,) vehicles that a link takes in a step: C - x, the third term of SPEC 2.3 before it is shared out."""
+        return (self.network.storage_veh - x_veh) * self._room_share
 
-    def step(self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any) -> tuple[ModelState, StepFlows]:
+    def opening(self, green_s: Any, green_end_s: Any) -> Any:
+        """(M,) share of what leaves in a step whose room reaches the link's entry within the same step.
+
+        `green_s` and `green_end_s` are by turn. With a step of a whole cycle a full link takes up in the step what
+        its own early green lets out of it.
+        """
+        ops = self.operations
+        left_s = self.step_s - self._wave_s[self.network.turn_link] - (green_end_s - green_s)
+        return ops.minimum(ops.maximum(left_s, 0.0) / ops.maximum(green_s, 1e-9), 1.0)
+
+    def step(
+        self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any, green_end_s: Any | None = None
+    ) -> tuple[ModelState, StepFlows]:
         """One step of the exact model.
 
         `green_s` (S,) is the green of each stage within the step, `demand_veh` (Z,) what comes from outside,
-        `fraction` (M,) the turning fractions. Vehicles are conserved, and 0 <= q <= x <= storage holds
-        afterwards if it held before.
+        `fraction` (M,) the turning fractions. `green_end_s` (M,) is when each turn's last green ends, counted from the
+        step's start: who reaches the queue after it waits for the next step. Without it the green may
+        stand anywhere. Vehicles are conserved, and 0 <= q <= x <= storage holds afterwards if it held before.
         """
         ops = self.operations
+        to_turns, to_next = self.leaves.T, self.feeds.T
         turn_green_s = ops.matmul(self.network.serves.T.astype(float), green_s)
         saturated = self.saturated_veh(turn_green_s, fraction)
-        room = ops.maximum(self.room_veh(state.x_veh), 0.0) * self._room_share
+        room = ops.maximum(self.room_veh(state.x_veh), 0.0)
+        opening = None if green_end_s is None else self.opening(turn_green_s, green_end_s)
         # Each turn's share of the room on the link that it feeds, among the turns that have green in this step;
         # exits have all the room in the world.
         open_fraction = fraction * ops.minimum(turn_green_s, 1.0)
         feeding = ops.matmul(self.feeds, open_fraction)
-        claim = open_fraction / ops.maximum(ops.matmul(self.feeds.T, feeding) + self._is_exit, 1e-9)
-        oversaturated = claim * ops.matmul(self.feeds.T, room) + INFINITE_ROOM_VEH * self._is_exit
-        limit = ops.minimum(saturated, oversaturated)
+        claim = open_fraction / ops.maximum(ops.matmul(to_next, feeding) + self._is_exit, 1e-9)
 
         queue = ops.matmul(self.leaves, state.q_veh)
         moving = state.x_veh - queue
-        share = self.on_the_way(self.delay_s(queue))
-        entering = ops.minimum(state.source_queue_veh + demand_veh, room) * self._is_source
+        delay = self.delay_s(queue)
+        share = self.on_the_way(delay)
+        share_at_end = None if green_end_s is None else self.on_the_way(ops.matmul(to_turns, delay), green_end_s)
+        past_by_turn = [ops.matmul(to_turns, past) for past in state.past_inflow_veh]
+        wanting = (state.source_queue_veh + demand_veh) * self._is_source
 
-        # With delays under one step the inflow depends on itself round a circuit: sweep to its fixed point.
-        inflow = entering
+        # With delays under one step the inflow depends on itself round a circuit, and so does the room: sweep to
+        # the fixed point that is reached from below.
+        open_room = room
+        inflow = entering = ops.minimum(wanting, room)
         for _ in range(self.sweeps):
             arriving = ops.maximum(self.arriving_veh(moving, inflow, state.past_inflow_veh, share), 0.0)
-            unsaturated = state.q_veh + fraction * ops.matmul(self.leaves.T, arriving)
-            leaving = ops.minimum(unsaturated, limit)
+            queued = state.q_veh + fraction * ops.matmul(to_turns, arriving)
+            unsaturated = queued
+            if share_at_end is not None:
+                inflow_by_turn, moving_by_turn = ops.matmul(to_turns, inflow), ops.matmul(to_turns, moving)
+                in_time = self.arriving_veh(moving_by_turn, inflow_by_turn, past_by_turn, share_at_end)
+                unsaturated = state.q_veh + fraction * ops.maximum(in_time, 0.0)
+            # SPEC 2.3, the three terms.
+            oversaturated = claim * ops.matmul(to_next, open_room) + INFINITE_ROOM_VEH * self._is_exit
+            leaving = ops.minimum(unsaturated, ops.minimum(saturated, oversaturated))
+            if opening is not None:
+                open_room = room + ops.matmul(self.leaves, opening * leaving)
+                entering = ops.minimum(wanting, open_room)
             last, inflow = inflow, entering + ops.matmul(self.feeds, leaving)
             if ops.settled(last, inflow):
                 break
 
         after = ModelState(
             x_veh=state.x_veh + inflow - ops.matmul(self.leaves, leaving),
-            q_veh=unsaturated - leaving,
+            q_veh=queued - leaving,
             source_queue_veh=state.source_queue_veh + demand_veh * self._is_source - entering,
-            past_inflow_veh=(inflow, *state.past_inflow_veh[:-1]),
+            past_inflow_veh=(*[inflow / self.samples] * self.samples, *state.past_inflow_veh)[: self.lags],
         )
         return after, StepFlows(leaving, inflow, arriving)
 
 
-def green_windows(network: Network, green_s: Floats, step_s: float) -> Floats:
-    """(..., steps, S) seconds of green of each stage in each model step of a control step.
+@dataclass(frozen=True)
+class GreenWindows:
+    """Where the green stands in the model steps of a control step."""
 
-    `green_s` (..., S) is what was planned. A junction's cycle starts at its offset and repeats within the control
-    step; before its first start the previous repetition of the same plan is still running. Discharge starts
-    `startup_lag_s` after the green and runs as long into the yellow.
+    shown_s: Floats
+    """(..., steps, S) seconds of green of each stage in each model step."""
+    end_s: Floats
+    """(..., steps, M) end of each turn's last green in each model step, from the model step's start; 0 without one."""
+
+
+def check_step(network: Network, step_s: float) -> None:
+    """Raise SettingError unless a model step of `step_s` divides the control step."""
+    if step_s <= 0 or abs(network.control_step_s / step_s - round(network.control_step_s / step_s)) > STEP_TOLERANCE:
+        whole = f"the control step of {network.control_step_s:g} s"
+        raise SettingError(f"setting 'step_s' is {step_s:g}: it must divide {whole}")
+
+
+def green_windows(network: Network, green_s: Floats, step_s: float) -> GreenWindows:
+    """The windows of a plan `green_s` (..., S) [s].
+
+    A junction's cycle starts at its offset and repeats within the control step; before its first start the previous
+    repetition of the same plan is still running. Discharge starts `startup_lag_s` after the green and runs as long
+    into the yellow.
     """
     steps = round(network.control_step_s / step_s)
     begin = np.arange(steps) * step_s
-    windows = np.zeros((*green_s.shape[:-1], steps, green_s.shape[-1]))
+    shape = (*green_s.shape[:-1], steps, green_s.shape[-1])
+    shown, last = np.zeros(shape), np.zeros(shape)
     for junction in network.junctions:
         repeats = int(np.ceil(network.control_step_s / junction.cycle_s))
         for repeat in range(-1, repeats):
             start = np.full(green_s.shape[:-1], junction.offset_s % junction.cycle_s + repeat * junction.cycle_s)
             for stage in junction.stages:
                 end = start + green_s[..., stage]
-                shown = [np.asarray(edge + network.startup_lag_s)[..., None] for edge in (start, end)]
-                overlap = np.minimum(shown[1], begin + step_s) - np.maximum(shown[0], begin)
-                windows[..., stage] += np.maximum(overlap, 0.0)
+                window = [np.asarray(edge + network.startup_lag_s)[..., None] for edge in (start, end)]
+                closes = np.minimum(window[1], begin + step_s) - begin
+                overlap = closes - np.maximum(window[0] - begin, 0.0)
+                shown[..., stage] += np.maximum(overlap, 0.0)
+                last[..., stage] = np.where(overlap > 0, np.maximum(last[..., stage], closes), last[..., stage])
                 start = end + network.stages[stage].clearance_s
-    return windows
+    by_turn = np.where(network.serves, last[..., None], 0.0).max(axis=-2)
+    return GreenWindows(shown, by_turn)

@@ -16,6 +16,7 @@ from utn_sumo.errors import ResultError
 LETTERS = frozenset("Ggyrsu")
 """What a working signal shows; SUMO's o and O are signals switched off."""
 GREEN = "Gg"
+LONG_AGO_S = -(10**9)
 
 
 @dataclass
@@ -84,7 +85,7 @@ class _Guard:
         self.foes = [[b for b in range(size) if junction.conflicts[a][b]] for a in range(size)]
         self.green_since = [0] * size
         self.yellow_since = [0] * size
-        self.last_green = [-(10**9)] * size
+        self.last_green = [LONG_AGO_S] * size
 
     def judge(self, stretches: list[tuple[str, range]]) -> None:
         """Look at every second in turn; signals change only where a stretch begins."""
@@ -112,7 +113,9 @@ class _Guard:
     def _change(self, signal: int, was: str, now: str, second: int, state: str) -> str:
         """What is wrong with one signal's change at this second; empty if nothing is."""
         if now in GREEN and was not in GREEN:
-            self.green_since[signal] = second
+            # A cycle with an offset is under way when the run begins: how long its green has lasted nobody saw.
+            under_way = second == 0 and self.junction.offset_s % self.junction.cycle_s > 0
+            self.green_since[signal] = LONG_AGO_S if under_way else second
             for foe in self.foes[signal]:
                 if now == "G" and state[foe] == "r" and second - self.last_green[foe] - 1 < self.clearance_s:
                     return f"turns green too soon after signal {foe}"

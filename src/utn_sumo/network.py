@@ -142,6 +142,7 @@ class _Reader:
             length_m=length,
             free_speed_m_s=length / sum(edge.getLength() / edge.getSpeed() for edge in edges),
             storage_veh=lane_m / SPACE_PER_VEHICLE_M,
+            queue_spacing_m=SPACE_PER_VEHICLE_M * length / lane_m,
             saturation_flow_veh_s=last.getLaneNumber() * SATURATION_FLOW_VEH_S_LANE,
             is_source=not fed,
         )

@@ -124,12 +124,14 @@ class Log:
     """(K, runs, M) estimated queues by turn at its start."""
     source_queue_veh: Floats
     """(K, runs, Z) estimated vehicles outside at its start."""
+    fraction: Floats
+    """(K, runs, M) estimated turning fractions at its start."""
     green_s: Floats
     """(K, runs, S) greens that were applied."""
     forecast_veh: Floats
     """(K, runs, Z) demand that was forecast for the step."""
-    entered_veh: Floats
-    """(K, runs, Z) counted into each link."""
+    entered_by_sample_veh: Floats
+    """(K, runs, P, Z) counted into each link, by sample."""
     turned_veh: Floats
     """(K, runs, M) counted out of it by turn."""
     true_x_veh: Floats
@@ -138,6 +140,11 @@ class Log:
     """(K, runs, Z) halting vehicles at its end."""
     true_waiting_veh: Floats
     """(K, runs, Z) vehicles waiting outside at its end."""
+
+    @property
+    def entered_veh(self) -> Floats:
+        """(K, runs, Z) counted into each link."""
+        return np.asarray(self.entered_by_sample_veh.sum(axis=-2))
 
     @classmethod
     def stack(cls, logs: Sequence[Log]) -> Log:
@@ -152,9 +159,10 @@ def read_log(folder: Path) -> Log:
         "x_veh": ("state", "x_veh"),
         "q_veh": ("state", "q_veh"),
         "source_queue_veh": ("state", "source_queue_veh"),
+        "fraction": ("state", "fraction"),
         "green_s": ("decision", "plan", "green_s"),
         "forecast_veh": ("forecast", "demand_veh", 0),
-        "entered_veh": ("seen", "entered_veh"),
+        "entered_by_sample_veh": ("seen", "entered_veh"),
         "turned_veh": ("seen", "turned_veh"),
         "true_x_veh": ("truth", "x_veh"),
         "true_queue_veh": ("truth", "queue_veh"),

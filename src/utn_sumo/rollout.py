@@ -1,9 +1,8 @@
 """The model run open loop over recorded runs: predictions from every control step, several steps ahead.
 
-`observe` follows the runs with the model and corrects it at the end of every control step by what was counted, as an
-observer does: x is the count, the inflow of the step is brought to the count of the entry loops but keeps the model's
-timing, and who is neither on the way nor gone is queued. `roll` then predicts from those states with the greens that
-were really applied. Both take the model step by step; a step of the whole cycle is the plain model of SPEC 2.
+`observe` says what the model knows at the start of every control step: x as estimated, the past inflows as the entry
+loops counted them, and as queued whoever is on the link and not on the way. `predict` takes the model on from those
+states under the greens that were really applied, in the model's own step; a step of the whole cycle is SPEC 2's model.
 
 Arrays have the control step first, then the run (see `Log.stack`), then link, turn or stage.
 """
@@ -21,9 +20,8 @@ from utn_sumo.recording import Log
 
 @dataclass(frozen=True)
 class Prediction:
-    """Open-loop predictions from the starts k = 1 ... K - H: arrays (H, starts, runs, Z)."""
+    """Open-loop predictions: arrays (H, starts, runs, Z)."""
 
-    starts: Ints
     x_veh: Floats
     """Vehicles at the end of each step ahead."""
     queue_veh: Floats
@@ -31,73 +29,72 @@ class Prediction:
     """Vehicles that enter within each step ahead."""
 
 
-def observe(model: LinkModel, log: Log) -> list[ModelState]:
-    """The model's state at the start of every control step of the runs, from nothing later than that."""
-    network = model.network
-    windows = np.moveaxis(green_windows(network, log.green_s, model.step_s), -2, 1)
-    steps = windows.shape[1]
-    none = np.zeros_like(log.x_veh[0])
-    state = ModelState(none, np.zeros_like(log.q_veh[0]), none, (none,) * model.lags)
-    states = []
-    for k in range(len(log.green_s)):
-        states.append(state)
-        inflows = []
-        ahead = state
-        demand = network.is_source * log.entered_veh[k] / steps
-        for window in windows[k]:
-            ahead, flows = model.step(ahead, window, demand, network.fraction)
-            inflows.append(flows.inflow_veh)
-        if k + 1 < len(log.green_s):
-            past = _counted(np.array(inflows), log.entered_veh[k])
-            state = _correct(model, log, k + 1, ahead.q_veh, (*past[::-1], *state.past_inflow_veh)[: model.lags])
-    return states
+def starts(log: Log, horizon: int) -> Ints:
+    """The control steps from which `horizon` steps ahead are on record, but for the first, when the road is empty."""
+    return np.arange(1, len(log.green_s) - horizon + 1)
 
 
-def _counted(inflow_veh: Floats, entered_veh: Floats) -> Floats:
-    """(steps, runs, Z) the model's inflows, brought to what was counted over the control step."""
-    total = inflow_veh.sum(axis=0)
-    return np.asarray(inflow_veh * np.where(total > 0, entered_veh / np.maximum(total, 1e-9), 1.0))
+def observe(model: LinkModel, log: Log, at: Ints, source_queue_veh: Floats) -> ModelState:
+    """The model's state (starts, runs, ·) at the start of the control steps `at`, from nothing later than that.
 
-
-def _correct(model: LinkModel, log: Log, k: int, split_veh: Floats, past: tuple[Floats, ...]) -> ModelState:
-    """The state at the start of step k: counts, and queues split by turn as the model's are."""
-    x = log.x_veh[k]
-    share = model.on_the_way(model.delay_s(log.q_veh[k] @ model.leaves.T))
-    moving = np.sum([share[lag] * past[lag - 1] for lag in range(1, model.lags)], axis=0)
-    queue = np.clip(x - moving, 0.0, x)
-    split = np.maximum(split_veh, 1e-6)
-    split = split / (split @ model.leaves.T @ model.leaves)
-    return ModelState(x, split * (queue @ model.leaves), log.source_queue_veh[k], past)
-
-
-def roll(model: LinkModel, log: Log, states: list[ModelState], demand_veh: Floats, horizon: int) -> Prediction:
-    """Predict `horizon` control steps from every start under the greens of the log.
-
-    `demand_veh` (K, runs, Z) is what wants to enter each source link in each control step, known or forecast.
+    `source_queue_veh` (K, runs, Z) is who waits outside, known or estimated.
     """
-    windows = np.moveaxis(green_windows(model.network, log.green_s, model.step_s), -2, 1)
-    starts = np.arange(1, len(log.green_s) - horizon + 1)
-    state = ModelState(
-        np.array([states[k].x_veh for k in starts]),
-        np.array([states[k].q_veh for k in starts]),
-        np.array([states[k].source_queue_veh for k in starts]),
-        tuple(np.array([states[k].past_inflow_veh[lag] for k in starts]) for lag in range(model.lags)),
-    )
+    network = model.network
+    counted = np.concatenate(list(log.entered_by_sample_veh), axis=-2)[:, ::-1]
+    steps, samples = len(log.green_s), log.entered_by_sample_veh.shape[-2]
+    # Newest first: what lies before the start of step k begins at this many samples from the newest of all.
+    past = [model.history(counted[:, (steps - k) * samples :], network.sample_s) for k in at]
+    past_inflow = tuple(np.array(lag) for lag in zip(*past, strict=True))
+    x, measured = log.x_veh[at], log.q_veh[at]
+    share = model.on_the_way(model.delay_s(measured @ model.leaves.T), 0.0)[1:]
+    moving = np.sum([part * inflow for part, inflow in zip(share, past_inflow, strict=True)], axis=0)
+    queue = np.clip(x - moving, 0.0, x)
+    # Who is queued beyond the measure has a turn that nobody knows yet.
+    more = np.maximum(queue - measured @ model.leaves.T, 0.0)
+    split = measured + log.fraction[at] * (more @ model.leaves) + 1e-9
+    split = split / (split @ model.leaves.T @ model.leaves)
+    return ModelState(x, split * (queue @ model.leaves), source_queue_veh[at], past_inflow)
+
+
+def predict(
+    model: LinkModel, log: Log, horizon: int, *, demand_veh: Floats, source_queue_veh: Floats, fraction: Floats
+) -> Prediction:
+    """Predict `horizon` control steps from each of `starts(log, horizon)` under the greens of the log.
+
+    `demand_veh` (K, runs, Z) is what wants to enter each source link in each control step, `source_queue_veh` (K, runs,
+    Z) who waits outside at its start, `fraction` (H, starts, runs, M) how the traffic turns in each step ahead.
+    """
+    at = starts(log, horizon)
+    state = observe(model, log, at, source_queue_veh)
+    windows = green_windows(model.network, log.green_s, model.step_s)
+    steps = windows.shown_s.shape[-2]
     x, queue, inflow = [], [], []
     for ahead in range(horizon):
         entered: Floats = np.zeros_like(state.x_veh)
-        for step in range(windows.shape[1]):
-            demand = demand_veh[starts + ahead] / windows.shape[1]
+        for step in range(steps):
+            shown, end = windows.shown_s[at + ahead, :, step], windows.end_s[at + ahead, :, step]
             flows: StepFlows
-            state, flows = model.step(state, windows[starts + ahead, step], demand, model.network.fraction)
+            state, flows = model.step(state, shown, demand_veh[at + ahead] / steps, fraction[ahead], end)
             entered = entered + flows.inflow_veh
         x.append(state.x_veh)
         queue.append(state.q_veh @ model.leaves.T)
         inflow.append(entered)
-    return Prediction(starts, np.array(x), np.array(queue), np.array(inflow))
+    return Prediction(np.array(x), np.array(queue), np.array(inflow))
 
 
 def known_demand_veh(network: Network, log: Log) -> Floats:
     """(K, runs, Z) vehicles that really wanted to enter each source link in each control step."""
-    before = np.concatenate([np.zeros_like(log.true_waiting_veh[:1]), log.true_waiting_veh[:-1]])
-    return np.asarray((log.entered_veh + log.true_waiting_veh - before) * network.is_source)
+    return np.asarray((log.entered_veh + log.true_waiting_veh - known_source_queue_veh(log)) * network.is_source)
+
+
+def known_source_queue_veh(log: Log) -> Floats:
+    """(K, runs, Z) vehicles that really waited outside at the start of each control step."""
+    return np.concatenate([np.zeros_like(log.true_waiting_veh[:1]), log.true_waiting_veh[:-1]])
+
+
+def known_fraction(network: Network, log: Log) -> Floats:
+    """(K, runs, M) how the traffic that left each link in each control step really turned."""
+    by_link = np.zeros((len(network.links), len(network.turns)))
+    by_link[network.turn_link, np.arange(len(network.turns))] = 1
+    left = log.turned_veh @ by_link.T @ by_link
+    return np.asarray(np.where(left > 0, log.turned_veh / np.where(left > 0, left, 1.0), network.fraction))

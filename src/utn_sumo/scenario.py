@@ -29,6 +29,8 @@ class Scenario(BaseModel):
     profile: Literal["peak", "paper", "constant"] = "peak"
     noise: float = Field(0.0, ge=0, le=2)
     """Standard deviation of the correlated noise on the demand, relative."""
+    loop_error: float = Field(0.0, ge=0, le=0.2)
+    """Standard deviation, over the loops, of the share of vehicles that a loop misses or counts twice."""
     calibration: str | None = None
     """Calibration file for the model; `none` for none, else the one beside the net if there is one."""
     seed: int = Field(1, ge=0, le=2**31 - 1)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from utn_sumo import bridge, calibration, floor, mismatch, network, plots, recording
-from utn_sumo.contract import Network
 from utn_sumo.errors import SettingError
+from utn_sumo.model import check_step
 from utn_sumo.recording import Log
 from utn_sumo.scenario import Scenario, scenario
 
@@ -43,12 +43,14 @@ def study_mismatch(
     step_s: float,
     horizon: int,
     inputs: str,
+    turning: str,
     with_floor: bool,
     tick: Callable[[], None],
 ) -> list[dict[str, Any]]:
     """The mismatch by demand: one object each, under the names of `mismatch.summary`."""
-    if inputs not in INPUTS:
-        raise SettingError(f"setting 'inputs' is {inputs!r}: it must be 'known' or 'forecast'")
+    for name, value in (("inputs", inputs), ("turning", turning)):
+        if value not in INPUTS:
+            raise SettingError(f"setting {name!r} is {value!r}: it must be 'known' or 'forecast'")
     whole = network.load(base["net"])
     model = calibration.for_model(whole, base.get("calibration"))
     check_step(whole, step_s)
@@ -64,7 +66,9 @@ def study_mismatch(
             cuts = np.linspace(1, len(log.green_s) - horizon, FLOOR_CUTS + 2)[1:-1].astype(int)
             floor_veh = floor.spread(whole, folders[0], cuts.tolist(), FLOOR_REPLICAS, horizon)
             tick()
-        found = mismatch.errors(model, log, step_s, horizon, inputs)
+        found = mismatch.errors(
+            model, log, step_s, horizon, known_demand=inputs == "known", known_turning=turning == "known"
+        )
         results.append(
             {
                 "net": base["net"],
@@ -74,18 +78,12 @@ def study_mismatch(
                 "hours": items[0].hours,
                 "step_s": step_s,
                 "inputs": inputs,
-                "turning": "fractions of the calibration or the net",
+                "turning": turning,
                 **mismatch.summary(model, found, floor_veh),
             }
         )
         plots.mismatch(results[-1], model, found, folder)
     return results
-
-
-def check_step(net: Network, step_s: float) -> None:
-    """Raise SettingError unless the model's step divides the control step."""
-    if step_s <= 0 or net.control_step_s % step_s:
-        raise SettingError(f"setting 'step' is {step_s:g}: it must divide the control step of {net.control_step_s:g} s")
 
 
 def study_calibration(
@@ -94,11 +92,20 @@ def study_calibration(
     seeds: Sequence[int],
     folder: Path,
     *,
+    step_s: float,
     tick: Callable[[], None],
 ) -> dict[str, Any]:
-    """Record runs and fit the model to them: the content of a calibration file."""
+    """Record runs and fit the model with a step of `step_s` to them: the content of a calibration file."""
+    whole = network.load(base["net"])
+    check_step(whole, step_s)
     items = [scenario(**base, demand=demand, seed=seed) for demand in demands for seed in seeds]
     log = Log.stack([recording.read_log(path) for path in record(items, folder, tick)])
-    fitted = calibration.calibrate(network.load(base["net"]), log)
-    made = {"net": base["net"], "controller": items[0].controller, "demands": list(demands), "seeds": list(seeds)}
+    fitted = calibration.calibrate(whole, log, step_s)
+    made = {
+        "step_s": step_s,
+        "net": base["net"],
+        "controller": items[0].controller,
+        "demands": list(demands),
+        "seeds": list(seeds),
+    }
     return {"made_from": {**made, "hours": items[0].hours}, **fitted}

@@ -20,7 +20,7 @@ from utn_sumo.scenario import scenario
 def one_step_rmse_veh(network: Network, folder: Path, step_s: float = 10.0) -> tuple[float, float]:
     """RMSE of the model and of persistence, one control step ahead."""
     log = recording.read_log(folder)
-    found = mismatch.errors(calibration.for_model(network, None), log, step_s, 1, "known")
+    found = mismatch.errors(calibration.for_model(network, None), log, step_s, 1)
     return float(np.sqrt(np.mean(found.x_veh**2))), float(np.sqrt(np.mean(found.persistence_veh**2)))
 
 
@@ -72,8 +72,9 @@ def test_mismatch_and_calibrate_work_from_the_command_line(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (["--step", "7"], "'step' is 7"),
+        (["--step", "7"], "'step_s' is 7"),
         (["--inputs", "guessed"], "'inputs' is 'guessed'"),
+        (["--turning", "guessed"], "'turning' is 'guessed'"),
         (["--horizon", "0"], "'horizon' is '0'"),
         (["--seeds", "two"], "'seeds' is 'two'"),
         (["--demand", "much"], "'demand' is 'much'"),

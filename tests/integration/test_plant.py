@@ -163,7 +163,7 @@ def test_loops_count_the_vehicles_that_drove(utn17: Network, tmp_path: Path) -> 
     with SumoPlant(utn17, routes, tmp_path, seed=1, duration_s=7200) as plant:
         while plant.truth is None or plant.time_s < 1800 or plant.truth.in_network_veh:
             seen = plant.run(utn17.equal_split())
-            entered, turned = entered + seen.entered_veh, turned + seen.turned_veh
+            entered, turned = entered + seen.entered_veh.sum(axis=0), turned + seen.turned_veh
             assert plant.truth is not None
             imbalance.append(entered - np.bincount(utn17.turn_link, turned) - plant.truth.x_veh)
 
@@ -179,6 +179,6 @@ def test_a_run_that_ends_amid_a_cycle_counts_up_to_its_end(utn17: Network, tmp_p
         assert plant.truth is not None
         present = plant.truth.x_veh
     turned = np.sum([step.turned_veh for step in steps], axis=0)
-    balance = sum(step.entered_veh for step in steps) - np.bincount(utn17.turn_link, turned)
+    balance = sum(step.entered_veh.sum(axis=0) for step in steps) - np.bincount(utn17.turn_link, turned)
     assert steps[-1].time_s == 900
     assert np.abs(balance - present).max() <= 2

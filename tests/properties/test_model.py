@@ -58,6 +58,12 @@ def some_inputs(model: LinkModel, rng: np.random.Generator) -> tuple[Floats, Flo
     return levels(rng, len(net.stages)) * model.step_s, demand, fraction
 
 
+def some_ends(model: LinkModel, rng: np.random.Generator, green: Floats) -> Floats:
+    """Ends of the turns' greens, anywhere in the step that leaves them their length."""
+    shown = np.minimum(green @ model.network.serves, model.step_s)
+    return shown + levels(rng, len(shown)) * (model.step_s - shown)
+
+
 def quiet_state(model: LinkModel, x: Floats | None = None, q: Floats | None = None) -> ModelState:
     nothing = np.zeros(len(model.network.links))
     q = np.zeros(len(model.network.turns)) if q is None else q
@@ -70,7 +76,7 @@ def test_vehicles_are_conserved(model_of: Callable[[float], LinkModel], seed: in
     model, rng = model_of(step_s), np.random.default_rng(seed)
     before = some_state(model, rng)
     green, demand, fraction = some_inputs(model, rng)
-    after, flows = model.step(before, green, demand, fraction)
+    after, flows = model.step(before, green, demand, fraction, some_ends(model, rng, green))
     left = model.leaves @ flows.leaving_veh
     assert after.x_veh == pytest.approx(before.x_veh + flows.inflow_veh - left, abs=1e-9)
     gone = flows.leaving_veh[model.network.turn_next == EXIT].sum()
@@ -85,7 +91,8 @@ def test_queues_fit_on_their_links_and_links_within_their_storage_for_ever(
     model, rng = model_of(step_s), np.random.default_rng(seed)
     state = some_state(model, rng)
     for _ in range(20):
-        state, flows = model.step(state, *some_inputs(model, rng))
+        green, *others = some_inputs(model, rng)
+        state, flows = model.step(state, green, *others, some_ends(model, rng, green))
         assert flows.leaving_veh.min() >= 0
         assert state.source_queue_veh.min() >= -1e-9
         assert state.q_veh.min() >= 0
@@ -98,10 +105,11 @@ def test_one_more_sweep_changes_nothing(model_of: Callable[[float], LinkModel], 
     model, rng = model_of(step_s), np.random.default_rng(seed)
     state = some_state(model, rng)
     green, demand, _ = some_inputs(model, rng)
+    ends = some_ends(model, rng, green)
     longer = LinkModel(model.network, step_s)
     longer.sweeps = model.sweeps + 1
     (after, flows), (again, flows_again) = (
-        each.step(state, green, demand, model.network.fraction) for each in (model, longer)
+        each.step(state, green, demand, model.network.fraction, ends) for each in (model, longer)
     )
     assert flows.inflow_veh == pytest.approx(flows_again.inflow_veh, abs=1e-9)
     assert flows.leaving_veh == pytest.approx(flows_again.leaving_veh, abs=1e-9)
@@ -113,10 +121,10 @@ def casadi_step(net: Network, step_s: float) -> Any:
 
     model = LinkModel(net, step_s, CasadiOperations())
     links, turns = len(net.links), len(net.turns)
-    sizes = [links, turns, links, *[links] * model.lags, len(net.stages), links, turns]
+    sizes = [links, turns, links, *[links] * model.lags, len(net.stages), links, turns, turns]
     symbols = [ca.SX.sym(f"p{position}", size) for position, size in enumerate(sizes)]
-    x, q, waiting, *past = symbols[:-3]
-    after, flows = model.step(ModelState(x, q, waiting, tuple(past)), *symbols[-3:])
+    x, q, waiting, *past = symbols[:-4]
+    after, flows = model.step(ModelState(x, q, waiting, tuple(past)), *symbols[-4:])
     results = [after.x_veh, after.q_veh, after.source_queue_veh, *after.past_inflow_veh]
     return ca.Function("step", symbols, [*results, flows.leaving_veh, flows.inflow_veh, flows.arriving_veh])
 
@@ -132,6 +140,7 @@ def test_casadi_and_numpy_agree(
 ) -> None:
     model, rng = model_of(step_s), np.random.default_rng(seed)
     state, inputs = some_state(model, rng), some_inputs(model, rng)
+    inputs = (*inputs, some_ends(model, rng, inputs[0]))
     after, flows = model.step(state, *inputs)
     numbers = [after.x_veh, after.q_veh, after.source_queue_veh, *after.past_inflow_veh]
     numbers += [flows.leaving_veh, flows.inflow_veh, flows.arriving_veh]
@@ -184,6 +193,37 @@ def test_demand_enters_at_sources_alone(utn17: Network) -> None:
     after, flows = model.step(quiet_state(model), np.zeros(17), np.full(17, 10.0), utn17.fraction)
     assert flows.inflow_veh == pytest.approx(10 * utn17.is_source)
     assert after.source_queue_veh == pytest.approx(0)
+
+
+def test_who_reaches_the_queue_after_the_green_waits_for_the_next(utn17: Network) -> None:
+    model = LinkModel(utn17, 120)
+    greens, demand = np.full(len(utn17.stages), 30.0), 12.0 * utn17.is_source
+    ends = np.full(len(utn17.turns), 30.0)
+    early, late = (
+        model.step(quiet_state(model), greens, demand, utn17.fraction, end)[0] for end in (ends, ends + 90.0)
+    )
+    # In free traffic an arrival every ten seconds is 36 s on the way: none of it is there before the early green ends.
+    assert model.leaves @ early.q_veh == pytest.approx(demand * (1 - utn17.free_time_s / 120))
+    assert model.leaves @ late.q_veh == pytest.approx(0, abs=1e-9)
+
+
+def test_a_full_link_takes_up_what_its_early_green_lets_out(utn17: Network) -> None:
+    model = LinkModel(utn17, 120)
+    link = utn17.link_index("10")
+    feeding, own = utn17.turn_next == link, utn17.turn_link == link
+    q = np.where(feeding, 30.0, np.where(own, 50.0, 0.0))
+    x = model.leaves @ q
+    x[link] = utn17.storage_veh[link]
+    greens = np.full(len(utn17.stages), 40.0)
+    inflow = []
+    for end in (40.0, 120.0):
+        ends = np.where(own, end, 60.0)
+        after, flows = model.step(quiet_state(model, x, q), greens, np.zeros(17), utn17.fraction, ends)
+        assert after.x_veh[link] <= utn17.storage_veh[link] + 1e-9
+        inflow.append(flows.inflow_veh[link])
+    # A green from the step's start opens room at the entry in time, one at its end does not.
+    assert inflow[0] == pytest.approx((model.leaves @ flows.leaving_veh)[link])
+    assert inflow[1] == 0
 
 
 @given(seed=SEEDS)

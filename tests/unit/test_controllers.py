@@ -93,6 +93,9 @@ def test_an_unknown_setting_is_named_beside_the_known_ones(utn17: Network, own: 
         ("horizon", 0),
         ("horizon", "long"),
         ("control_horizon", 61),
+        ("step_s", 0),
+        ("step_s", -60),
+        ("step_s", "short"),
         ("cost", "time"),
         ("q", -1),
         ("iterations", 0),
@@ -111,6 +114,13 @@ def test_a_control_horizon_beyond_the_horizon_is_refused(utn17: Network) -> None
     line = complaint(utn17, "dmpc", SettingError, horizon=3, control_horizon=5)
     assert "control_horizon 5" in line
     assert "horizon 3" in line
+
+
+@pytest.mark.parametrize("step_s", [7, 50.0, 90, 240])
+def test_a_model_step_that_does_not_divide_the_control_step_is_refused(utn17: Network, step_s: float) -> None:
+    line = complaint(utn17, "dmpc", SettingError, step_s=step_s)
+    assert f"setting 'step_s' is {step_s:g}: it must divide" in line
+    assert "120 s" in line
 
 
 def test_a_missing_file_or_class_is_named(utn17: Network, own: Path) -> None:

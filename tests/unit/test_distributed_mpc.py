@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import cycle
 from typing import Any
 
 import daqp
@@ -14,12 +15,18 @@ from hypothesis import strategies as st
 
 from utn_controllers.distributed_mpc import DistributedMPC, Settings
 from utn_controllers.distributed_mpc.coordination import Consensus
-from utn_controllers.distributed_mpc.problem import REGULARISATION, JunctionProblem, QuadraticProgram, remaining_steps
+from utn_controllers.distributed_mpc.problem import (
+    REGULARISATION,
+    JunctionProblem,
+    QuadraticProgram,
+    Timing,
+    remaining_steps,
+)
 from utn_controllers.distributed_mpc.whole import optimum
 from utn_sumo import signals
 from utn_sumo.contract import EXIT, Floats, Forecast, Network, Plan, State
-from utn_sumo.errors import ControllerError
-from utn_sumo.model import LinkModel, ModelState, StepFlows
+from utn_sumo.errors import ControllerError, SettingError
+from utn_sumo.model import LinkModel, ModelState, StepFlows, green_windows
 
 SEEDS = st.integers(0, 2**32 - 1)
 HORIZON = 7
@@ -28,6 +35,32 @@ HORIZON = 7
 @pytest.fixture(params=["utn17", "utn17-long"], scope="module")
 def net(request: pytest.FixtureRequest, utn17: Network, utn17_long: Network) -> Network:
     return utn17 if request.param == "utn17" else utn17_long
+
+
+def retimed(net: Network, name: str, *clocks: tuple[float, float]) -> Network:
+    """The network with these (cycle, offset) at its junctions, over and over."""
+    junctions = [
+        replace(junction, cycle_s=cycle_s, offset_s=offset_s)
+        for junction, (cycle_s, offset_s) in zip(net.junctions, cycle(clocks), strict=False)
+    ]
+    return replace(net, name=name, junctions=tuple(junctions))
+
+
+@pytest.fixture(scope="module")
+def mixed(utn17: Network) -> Network:
+    """utn17 with junctions of 60 and of 120 s, some of them offset."""
+    return retimed(utn17, "mixed", (120, 0), (60, 20), (120, 45), (60, 0))
+
+
+@pytest.fixture(scope="module")
+def motley(utn17: Network) -> Network:
+    """utn17 with junctions of 60, 90 and 120 s: a control step of 360 s."""
+    return retimed(utn17, "motley", (120, 0), (60, 20), (90, 40))
+
+
+@pytest.fixture(params=["utn17", "utn17-long", "mixed"], scope="module")
+def any_net(request: pytest.FixtureRequest, utn17: Network, utn17_long: Network, mixed: Network) -> Network:
+    return {"utn17": utn17, "utn17-long": utn17_long, "mixed": mixed}[request.param]
 
 
 @pytest.fixture(params=["tts", "paper"], scope="module")
@@ -40,22 +73,37 @@ def levels(rng: np.random.Generator, *shape: int) -> Floats:
     return np.clip(rng.uniform(-0.3, 1.3, shape), 0, 1)
 
 
+def some_split(net: Network, rng: np.random.Generator) -> Floats:
+    """Shares of the turns, which sum to 1 over a link."""
+    weight = levels(rng, len(net.turns)) + 1e-3
+    return np.asarray(weight / np.bincount(net.turn_link, weight)[net.turn_link])
+
+
 def some_state(net: Network, rng: np.random.Generator) -> State:
     """Queues within x, x within storage, and past inflows that can still be on their way."""
-    links, turns = len(net.links), len(net.turns)
+    links = len(net.links)
     x = rng.uniform(0, 1) * levels(rng, links) * net.storage_veh
     queue = levels(rng, links) * x
-    weight = levels(rng, turns) + 1e-3
-    share = weight / np.bincount(net.turn_link, weight)[net.turn_link]
+    entered = levels(rng, net.delay_samples, links) + 1e-9
     return State(
         cycle=0,
         time_s=0.0,
         x_veh=x,
-        q_veh=share * queue[net.turn_link],
+        q_veh=some_split(net, rng) * queue[net.turn_link],
         source_queue_veh=net.is_source * levels(rng, links) * 30,
-        past_inflow_veh=levels(rng, net.delay_steps, links) * (x - queue) / net.delay_steps,
-        turned_veh=np.zeros(turns),
+        past_inflow_veh=entered / entered.sum(axis=0) * levels(rng, links) * (x - queue),
+        turned_veh=np.zeros(len(net.turns)),
+        fraction=some_split(net, rng),
     )
+
+
+def quiet_state(net: Network, x: Floats | None = None, q: Floats | None = None) -> State:
+    """Nobody on the road but `x` (Z,) and, among these, the queues `q` (M,)."""
+    links, turns = np.zeros(len(net.links)), np.zeros(len(net.turns))
+    q = turns if q is None else q
+    on_links = np.bincount(net.turn_link, q).astype(float) if x is None else x
+    past = np.zeros((net.delay_samples, len(net.links)))
+    return State(0, 0.0, on_links, q, links, past, turns, net.fraction)
 
 
 def some_forecast(net: Network, rng: np.random.Generator, horizon: int = HORIZON) -> Forecast:
@@ -79,45 +127,56 @@ def assert_admissible(net: Network, plan: Plan) -> None:
         signals.admit(Plan(green_s), net)
 
 
-@given(seed=SEEDS)
-@limits(max_examples=10)
-def test_greens_fill_every_cycle_and_keep_every_least(net: Network, cost: str, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    plan = DistributedMPC(net, cost=cost).plan(some_state(net, rng), some_forecast(net, rng))
-    assert plan.green_s.shape == (17,)
-    assert plan.ahead_s is not None
-    assert plan.ahead_s.shape == (3, 17)
-    assert_admissible(net, plan)
+def test_greens_fill_every_cycle_and_keep_every_least(net: Network, cost: str) -> None:
+    rng, mpc = np.random.default_rng(19), DistributedMPC(net, cost=cost)
+    for _ in range(10):
+        plan = mpc.plan(some_state(net, rng), some_forecast(net, rng))
+        assert plan.green_s.shape == (17,)
+        assert plan.ahead_s is not None
+        assert plan.ahead_s.shape == (3, 17)
+        assert_admissible(net, plan)
 
 
-@pytest.mark.parametrize("seed", range(4))
+def patient(net: Network, **chosen: Any) -> DistributedMPC:
+    return DistributedMPC(net, iterations=400, tolerance_abs=1e-4, tolerance_rel=1e-5, **chosen)
+
+
+def gap_to_the_optimum(mpc: DistributedMPC, state: State, forecast: Forecast) -> float:
+    """How much dearer the next plan is than the best one, as a share."""
+    problems, timing = [agent.problem for agent in mpc.agents], mpc.timing()
+    best, _ = optimum(problems, state, forecast, timing)
+    reached, _ = optimum(problems, state, forecast, timing, all_greens(mpc.plan(state, forecast)))
+    return (reached - best) / abs(best)
+
+
+@pytest.mark.parametrize("seed", range(2))
 def test_many_iterations_reach_the_optimum_of_the_whole_problem(net: Network, cost: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    state, forecast = some_state(net, rng), some_forecast(net, rng)
-    mpc = DistributedMPC(net, cost=cost, iterations=400, tolerance_abs=1e-4, tolerance_rel=1e-5)
-    greens = all_greens(mpc.plan(state, forecast))
-    problems = [agent.problem for agent in mpc.agents]
-    best, _ = optimum(problems, state, forecast)
-    reached, _ = optimum(problems, state, forecast, greens)
-    assert -1e-6 * abs(best) <= reached - best <= 1e-3 * abs(best)
+    gap = gap_to_the_optimum(patient(net, cost=cost), some_state(net, rng), some_forecast(net, rng))
+    assert -1e-6 <= gap <= 1e-3
+
+
+@pytest.mark.parametrize("step_s", [60.0, 30.0])
+def test_so_they_do_with_a_finer_model_step_and_with_mixed_cycles(mixed: Network, cost: str, step_s: float) -> None:
+    rng = np.random.default_rng(17)
+    mpc = patient(mixed, cost=cost, horizon=2, step_s=step_s)
+    gap = gap_to_the_optimum(mpc, some_state(mixed, rng), some_forecast(mixed, rng, 2))
+    assert -1e-6 <= gap <= 1e-3
 
 
 def test_a_plan_answers_to_the_present_state_and_not_to_an_earlier_one(net: Network, cost: str) -> None:
     rng = np.random.default_rng(13)
-    mpc = DistributedMPC(net, cost=cost, iterations=400, tolerance_abs=1e-4, tolerance_rel=1e-5)
-    problems = [agent.problem for agent in mpc.agents]
+    mpc = patient(net, cost=cost)
     for _ in range(3):
-        state, forecast = some_state(net, rng), some_forecast(net, rng)
-        best, _ = optimum(problems, state, forecast)
-        reached, _ = optimum(problems, state, forecast, all_greens(mpc.plan(state, forecast)))
-        assert reached - best <= 1e-3 * abs(best)
+        assert gap_to_the_optimum(mpc, some_state(net, rng), some_forecast(net, rng)) <= 1e-3
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_time_spent_is_never_saved_by_filling_a_link_beyond_its_storage(utn17: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    problems = [JunctionProblem(utn17, junction, Settings()) for junction in range(8)]
-    _, solutions = optimum(problems, some_state(utn17, rng), some_forecast(utn17, rng))
+    timing = Timing.of(LinkModel(utn17, utn17.control_step_s), some_greens(utn17, rng))
+    problems = problems_of(utn17, HORIZON)
+    _, solutions = optimum(problems, some_state(utn17, rng), some_forecast(utn17, rng), timing)
     for problem, solution in zip(problems, solutions, strict=True):
         assert solution[problem.layout.over_storage].max() < 1e-3
 
@@ -126,65 +185,163 @@ def test_a_better_plan_than_the_equal_split_is_found(utn17: Network) -> None:
     rng = np.random.default_rng(3)
     state, forecast = some_state(utn17, rng), some_forecast(utn17, rng)
     mpc = DistributedMPC(utn17)
-    greens = all_greens(mpc.plan(state, forecast))
-    problems = [agent.problem for agent in mpc.agents]
-    costs = [
-        optimum(problems, state, forecast, plan)[0] for plan in (greens, np.tile(utn17.equal_split().green_s, (4, 1)))
-    ]
-    assert costs[0] < costs[1]
+    problems, timing = [agent.problem for agent in mpc.agents], mpc.timing()
+    greens, equal = all_greens(mpc.plan(state, forecast)), np.tile(utn17.equal_split().green_s, (4, 1))
+    found, split = (optimum(problems, state, forecast, timing, plan)[0] for plan in (greens, equal))
+    assert found < split
+
+
+def time_spent(net: Network, state: State, forecast: Forecast, greens: Floats) -> float:
+    """Vehicles in the network and waiting outside, summed over the horizon by the model at its finest, in cycles."""
+    model = LinkModel(net, net.sample_s)
+    now, total = at_start(model, state), 0.0
+    for step, demand in enumerate(forecast.demand_veh):
+        windows = green_windows(net, greens[min(step, len(greens) - 1)], model.step_s)
+        for shown, end in zip(windows.shown_s, windows.end_s, strict=True):
+            now, _ = model.step(now, shown, demand / net.samples, state.fraction, end)
+            total += now.x_veh.sum() + now.source_queue_veh.sum()
+    return total / net.samples
+
+
+def test_a_finer_model_step_saves_as_much_time_as_the_whole_cycle_at_least(utn17: Network) -> None:
+    equal = utn17.equal_split().green_s[None]
+    planners = {step_s: DistributedMPC(utn17, step_s=step_s) for step_s in (120.0, 60.0)}
+    spent = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        state, forecast = some_state(utn17, rng), some_forecast(utn17, rng)
+        plans = [equal, *(all_greens(mpc.plan(state, forecast)) for mpc in planners.values())]
+        spent.append([time_spent(utn17, state, forecast, greens) for greens in plans])
+        assert spent[-1][2] < spent[-1][0]
+    split, whole, finer = np.sum(spent, axis=0)
+    assert finer <= whole < 0.95 * split
 
 
 def test_the_longer_queue_gets_the_longer_green(utn17: Network, cost: str) -> None:
-    state = some_state(utn17, np.random.default_rng(0))
     q = np.where(utn17.turn_link == utn17.link_index("6"), 90.0, 0.0) * utn17.fraction
-    x = np.bincount(utn17.turn_link, q)
-    state = replace(state, x_veh=x, q_veh=q, source_queue_veh=np.zeros(17), past_inflow_veh=np.zeros((2, 17)))
     mpc = DistributedMPC(utn17, cost=cost, r=1e-4)
-    green = mpc.plan(state, Forecast(np.zeros((HORIZON, 17)))).green_s
+    green = mpc.plan(quiet_state(utn17, q=q), Forecast(np.zeros((HORIZON, 17)))).green_s
     junction = utn17.junctions[2]
     assert green[junction.stages[0]] > green[junction.stages[1]]
 
 
+def test_green_goes_where_the_turning_fractions_let_traffic_out(utn17: Network, cost: str) -> None:
+    # Links 6 and 7 meet at J3: both turn to link 4, which is full, or out of the network.
+    from_6, from_7 = (utn17.turn_link == utn17.link_index(link) for link in ("6", "7"))
+    leaves = utn17.turn_next == EXIT
+    x = np.zeros(17)
+    x[[utn17.link_index(link) for link in ("4", "6", "7")]] = utn17.storage_veh[3], 80.0, 80.0
+    mpc = DistributedMPC(utn17, cost=cost, r=1e-4, horizon=2)
+    longer = []
+    for out, blocked in ((from_6, from_7), (from_7, from_6)):
+        fraction = np.where(out, np.where(leaves, 0.95, 0.05), utn17.fraction)
+        fraction = np.where(blocked, np.where(leaves, 0.05, 0.95), fraction)
+        # 80 vehicles that nobody has seen turn yet.
+        state = replace(quiet_state(utn17, x), fraction=fraction)
+        green = mpc.plan(state, Forecast(np.zeros((2, 17)))).green_s
+        first, second = (green[np.flatnonzero(utn17.serves[:, turns].any(axis=1))].item() for turns in (out, blocked))
+        longer.append(first - second)
+    assert min(longer) > 10
+
+
+def test_who_reaches_the_queue_after_its_green_leaves_a_step_later(utn17: Network) -> None:
+    demand = np.zeros((3, 17))
+    demand[0] = 24.0 * utn17.is_source
+    mpc = DistributedMPC(utn17, horizon=3)
+    problems, timing = [agent.problem for agent in mpc.agents], mpc.timing()
+    _, solutions = optimum(problems, quiet_state(utn17), Forecast(demand), timing)
+    # One vehicle every five seconds, each as long on the way as the free road takes.
+    in_time = (np.maximum(timing.end_s[0] - utn17.free_time_s[utn17.turn_link], 0) / 5) * utn17.fraction
+    for problem, solution in zip(problems, solutions, strict=True):
+        from_outside = utn17.is_source[utn17.turn_link[problem.turns]]
+        turns = problem.turns[from_outside]
+        leaving = solution[problem.layout.leaving][:, from_outside]
+        assert leaving[0] == pytest.approx(in_time[turns], abs=0.01)
+        assert leaving[1] == pytest.approx(24 * utn17.fraction[turns] - in_time[turns], abs=0.01)
+    assert in_time.min() < 0.2 * 24 * utn17.fraction[in_time.argmin()]
+
+
+def test_the_green_is_expected_where_the_last_plan_foresaw_it(utn17: Network) -> None:
+    mpc, model = DistributedMPC(utn17, step_s=60.0, horizon=2), LinkModel(utn17, 60.0)
+    foreseen = utn17.equal_split().green_s
+    for _ in range(3):
+        timing, expected = mpc.timing(), Timing.of(model, foreseen)
+        assert timing.shown == pytest.approx(expected.shown)
+        assert timing.end_s == pytest.approx(expected.end_s)
+        assert timing.opening == pytest.approx(expected.opening)
+        foreseen = all_greens(ask(mpc))[1]
+
+
 @given(seed=SEEDS)
 @limits(max_examples=3)
-def test_every_problem_is_convex(net: Network, cost: str, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    state, forecast = some_state(net, rng), some_forecast(net, rng)
-    for agent in mpc_of(net, cost).agents:
-        program = agent.problem.program(state, forecast)
+def test_every_problem_is_convex(any_net: Network, cost: str, seed: int) -> None:
+    net, rng = any_net, np.random.default_rng(seed)
+    state, forecast = some_state(net, rng), some_forecast(net, rng, 3)
+    timing = Timing.of(LinkModel(net, 60.0), some_greens(net, rng))
+    for problem in problems_of(net, 3, cost, 60.0, control_horizon=2):
+        program = problem.program(state, forecast, timing)
         assert program.hessian == pytest.approx(program.hessian.T, abs=1e-12)
         assert np.linalg.eigvalsh(program.hessian).min() > -1e-9
         assert (program.lower <= program.upper).all()
 
 
-BUILT: dict[tuple[str, str], DistributedMPC] = {}
+PROBLEMS: dict[tuple[Any, ...], list[JunctionProblem]] = {}
 
 
-def mpc_of(net: Network, cost: str) -> DistributedMPC:
-    return BUILT.setdefault((net.name, cost), DistributedMPC(net, cost=cost))
+def problems_of(
+    net: Network, horizon: int, cost: str = "tts", step_s: float | None = None, control_horizon: int = 1
+) -> list[JunctionProblem]:
+    """The problems of all junctions."""
+    key = net.name, horizon, cost, step_s, control_horizon
+    if key not in PROBLEMS:
+        chosen: dict[str, Any] = {"control_horizon": control_horizon, "cost": cost, "step_s": step_s}
+        settings = Settings(horizon=horizon, **chosen)
+        PROBLEMS[key] = [JunctionProblem(net, junction, settings) for junction in range(len(net.junctions))]
+    return PROBLEMS[key]
 
 
-ONE_STEP: dict[tuple[str, str], list[JunctionProblem]] = {}
+class ConstantDelay(LinkModel):
+    """The exact model but for the delay, which stays what it is at the start, as it does in the problem."""
+
+    def __init__(self, net: Network, step_s: float, state: State):
+        super().__init__(net, step_s)
+        self.constant_s = super().delay_s(self.leaves @ state.q_veh)
+
+    def delay_s(self, queue_veh: Any) -> Any:
+        return self.constant_s
 
 
-def one_step_problems(net: Network, cost: str) -> list[JunctionProblem]:
-    chosen = Settings(horizon=1, control_horizon=1, cost=cost, crowding=1.0, q=0.1, r=0.3)
-    if (net.name, cost) not in ONE_STEP:
-        ONE_STEP[net.name, cost] = [JunctionProblem(net, junction, chosen) for junction in range(8)]
-    return ONE_STEP[net.name, cost]
+def at_start(model: LinkModel, state: State) -> ModelState:
+    past = model.history(state.past_inflow_veh, model.network.sample_s)
+    return ModelState(state.x_veh, state.q_veh, state.source_queue_veh, past)
 
 
-def exact_step(net: Network, state: State, green: Floats, forecast: Forecast) -> tuple[ModelState, StepFlows]:
-    before = ModelState(state.x_veh, state.q_veh, state.source_queue_veh, tuple(state.past_inflow_veh))
-    return LinkModel(net, net.control_step_s).step(before, green, forecast.demand_veh[0], net.fraction)
+@dataclass(frozen=True)
+class Run:
+    """A model's way over the horizon under greens that stay the same, one entry for each model step."""
+
+    states: list[ModelState]
+    """With the one at the start, and so one more."""
+    flows: list[StepFlows]
+
+    @classmethod
+    def of(cls, model: LinkModel, state: State, green: Floats, forecast: Forecast) -> Run:
+        windows = green_windows(model.network, green, model.step_s)
+        states, flows = [at_start(model, state)], []
+        for demand in forecast.demand_veh / len(windows.shown_s):
+            for shown, end in zip(windows.shown_s, windows.end_s, strict=True):
+                after, moved = model.step(states[-1], shown, demand, state.fraction, end)
+                states.append(after)
+                flows.append(moved)
+        return cls(states, flows)
 
 
-def decision(problem: JunctionProblem, green: Floats, flows: StepFlows) -> Floats:
-    """The exact model's flows as this junction's decision vector."""
+def decision(problem: JunctionProblem, green: Floats, run: Run) -> Floats:
+    """The model's flows as this junction's decision vector."""
     z = np.zeros(problem.layout.size)
-    z[problem.layout.green[0]] = green[problem.stages]
-    z[problem.layout.leaving[0]] = flows.leaving_veh[problem.turns]
-    z[problem.layout.inflow[0]] = flows.inflow_veh[problem.links]
+    z[problem.layout.green] = green[problem.stages]
+    z[problem.layout.leaving] = [flows.leaving_veh[problem.turns] for flows in run.flows]
+    z[problem.layout.inflow] = [flows.inflow_veh[problem.links] for flows in run.flows]
     return z
 
 
@@ -194,44 +351,96 @@ def excess(program: QuadraticProgram, z: Floats) -> float:
     return float(np.maximum(program.lower - rows, rows - program.upper).max(initial=0))
 
 
-@given(seed=SEEDS)
-@limits(max_examples=15)
-def test_flows_of_the_exact_model_are_feasible_and_the_most_that_may_leave(net: Network, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    state, green, forecast = some_state(net, rng), some_greens(net, rng), some_forecast(net, rng, 1)
-    _, flows = exact_step(net, state, green, forecast)
-    for problem in one_step_problems(net, "tts"):
-        program, z = problem.program(state, forecast), decision(problem, green, flows)
+def assert_feasible_and_the_most(
+    problems: list[JunctionProblem], model: LinkModel, state: State, green: Floats, forecast: Forecast
+) -> None:
+    """The model's flows are feasible, and neither more could leave the network nor more come in than there is room."""
+    net, timing, run = model.network, Timing.of(model, green), Run.of(model, state, green, forecast)
+    shown = green_windows(net, green, model.step_s).shown_s
+    for problem in problems:
+        program, z = problem.program(state, forecast, timing), decision(problem, green, run)
         assert excess(program, z) < 1e-6
-        for position in np.flatnonzero(net.turn_next[problem.turns] == EXIT):
-            more = z.copy()
-            more[problem.layout.leaving[0, position]] += 0.1
-            assert excess(program, more) > 0.09
-        for position in np.flatnonzero(~net.is_source[problem.links]):
-            room = problem.part.storage_veh[position] - state.x_veh[problem.links[position]]
-            crowded = z.copy()
-            crowded[problem.layout.inflow[0, position]] = room + 0.1
-            assert excess(program, crowded) > 0.09
+        for step, (before, flows) in enumerate(zip(run.states, run.flows, strict=False)):
+            for position in np.flatnonzero(net.turn_next[problem.turns] == EXIT):
+                more = z.copy()
+                more[problem.layout.leaving[step, position]] += 0.1
+                assert excess(program, more) > 0.09
+            end = timing.end_s[step % len(shown)]
+            opened = model.opening(shown[step % len(shown)] @ net.serves, end) * flows.leaving_veh
+            room = model.room_veh(before.x_veh) + model.leaves @ opened
+            for position in np.flatnonzero(~net.is_source[problem.links]):
+                crowded = z.copy()
+                crowded[problem.layout.inflow[step, position]] = room[problem.links[position]] + 0.1
+                assert excess(program, crowded) > 0.09
 
 
 @given(seed=SEEDS)
-@limits(max_examples=15)
-def test_the_cost_of_a_step_is_what_the_exact_model_spends(net: Network, cost: str, seed: int) -> None:
+def test_flows_of_the_exact_model_are_feasible_and_the_most_that_may_leave(any_net: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    state, green, forecast = some_state(net, rng), some_greens(net, rng), some_forecast(net, rng, 1)
-    after, flows = exact_step(net, state, green, forecast)
-    x, waiting = after.x_veh, after.source_queue_veh
+    state, green, forecast = some_state(any_net, rng), some_greens(any_net, rng), some_forecast(any_net, rng, 1)
+    model = LinkModel(any_net, any_net.control_step_s)
+    assert_feasible_and_the_most(problems_of(any_net, 1), model, state, green, forecast)
+
+
+@pytest.mark.parametrize("step_s", [120.0, 60.0, 30.0])
+@given(seed=SEEDS)
+@limits(max_examples=15)
+def test_while_the_delay_stands_so_they_are_in_every_model_step_of_the_horizon(
+    any_net: Network, step_s: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    state, green, forecast = some_state(any_net, rng), some_greens(any_net, rng), some_forecast(any_net, rng, 3)
+    model = ConstantDelay(any_net, step_s, state)
+    assert_feasible_and_the_most(problems_of(any_net, 3, step_s=step_s), model, state, green, forecast)
+
+
+@given(seed=SEEDS)
+def test_so_they_are_where_a_control_step_has_several_cycles_and_model_steps(motley: Network, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    state, green, forecast = some_state(motley, rng), some_greens(motley, rng), some_forecast(motley, rng, 2)
+    model = ConstantDelay(motley, 120.0, state)
+    assert_feasible_and_the_most(problems_of(motley, 2, step_s=120.0), model, state, green, forecast)
+
+
+@pytest.mark.parametrize(("horizon", "step_s"), [(1, None), (3, 60.0), (3, 30.0)])
+@given(seed=SEEDS)
+@limits(max_examples=5)
+def test_the_cost_of_a_plan_is_what_the_exact_model_spends(
+    any_net: Network, cost: str, horizon: int, step_s: float | None, seed: int
+) -> None:
+    net, rng = any_net, np.random.default_rng(seed)
+    state, green, forecast = some_state(net, rng), some_greens(net, rng), some_forecast(net, rng, horizon)
+    model = ConstantDelay(net, step_s or net.control_step_s, state)
+    run = Run.of(model, state, green, forecast)
+    x, waiting = (np.array([getattr(s, name) for s in run.states[1:]]) for name in ("x_veh", "source_queue_veh"))
     if cost == "tts":
-        expected = x.sum() + waiting.sum() + (x**2 / net.storage_veh).sum() + 1e-4 * (green**2).sum()
-        expected += remaining_steps(net) @ (x + waiting)
+        per_step = (x + waiting + x**2 / net.storage_veh).sum(axis=1)
+        expected = 1e-4 * (green**2).sum() + remaining_steps(net) @ (x[-1] + waiting[-1])
     else:
-        expected = 0.1 * ((x**2).sum() + (waiting**2).sum()) + 0.3 * (green**2).sum()
-    expected += REGULARISATION / 2 * ((flows.leaving_veh**2).sum() + (flows.inflow_veh**2).sum())
-    found = 0.0
-    for problem in one_step_problems(net, cost):
-        program, z = problem.program(state, forecast), decision(problem, green, flows)
+        per_step = 0.1 * (x**2 + waiting**2).sum(axis=1)
+        expected = 0.3 * (green**2).sum()
+    expected += per_step.sum() * model.step_s / net.control_step_s
+    expected += REGULARISATION / 2 * sum((f.leaving_veh**2).sum() + (f.inflow_veh**2).sum() for f in run.flows)
+    found: Any = 0.0
+    timing = Timing.of(model, green)
+    for problem in problems_of(net, horizon, cost, step_s):
+        program, z = problem.program(state, forecast, timing), decision(problem, green, run)
         found += z @ program.hessian @ z / 2 + program.gradient @ z + program.constant
     assert found == pytest.approx(expected, rel=1e-9)
+
+
+# A known weakness and no promise yet. A bound alone is no cure: who gets more green must also see where the rest goes.
+@pytest.mark.xfail(reason="Timing.shown scales without end: 100 s of green fit into a step of 60 s", strict=True)
+@pytest.mark.parametrize("step_s", [60.0, 30.0])
+def test_no_model_step_lets_out_more_than_green_all_through_it_would(utn17: Network, step_s: float) -> None:
+    link = utn17.link_index("6")
+    q = np.where(utn17.turn_link == link, 100.0, 0.0) * utn17.fraction
+    problems = problems_of(utn17, 2, step_s=step_s)
+    timing = Timing.of(LinkModel(utn17, step_s), utn17.equal_split().green_s)
+    _, solutions = optimum(problems, quiet_state(utn17, q=q), Forecast(np.zeros((2, 17))), timing)
+    problem, solution = problems[utn17.links[link].junction], solutions[utn17.links[link].junction]
+    leaving = solution[problem.layout.leaving][:, utn17.turn_link[problem.turns] == link].sum(axis=1)
+    assert leaving.max() <= utn17.saturation_flow_veh_s[link] * step_s + 1e-3
 
 
 @pytest.mark.parametrize(
@@ -242,6 +451,9 @@ def test_the_cost_of_a_step_is_what_the_exact_model_spends(net: Network, cost: s
         ({"horizon": 7, "control_horizon": 7}, 7),
         ({"horizon": 12}, 4),
         ({"horizon": 12, "control_horizon": 1}, 1),
+        ({"horizon": 1, "step_s": 60}, 1),
+        ({"horizon": 5, "control_horizon": 2, "step_s": 40}, 2),
+        ({"horizon": 2, "step_s": 10}, 2),
     ],
 )
 def test_any_horizon_gives_a_plan_for_its_control_horizon(utn17: Network, chosen: dict[str, int], greens: int) -> None:
@@ -251,36 +463,70 @@ def test_any_horizon_gives_a_plan_for_its_control_horizon(utn17: Network, chosen
     assert_admissible(utn17, plan)
 
 
-@pytest.mark.parametrize("lost_veh", [0.1, 1.0, 3.0])
-def test_a_miscount_of_few_vehicles_never_leaves_the_controller_without_a_plan(net: Network, lost_veh: float) -> None:
-    past = np.zeros((net.delay_steps, 17))
+@pytest.mark.parametrize("step_s", [60.0, 30.0])
+def test_a_finer_model_step_gives_admissible_plans(any_net: Network, cost: str, step_s: float) -> None:
+    rng = np.random.default_rng(23)
+    mpc = DistributedMPC(any_net, cost=cost, step_s=step_s, horizon=3)
+    for _ in range(3):
+        assert_admissible(any_net, mpc.plan(some_state(any_net, rng), some_forecast(any_net, rng, 3)))
+
+
+@pytest.mark.parametrize("step_s", [50.0, 240.0])
+def test_a_model_step_that_does_not_divide_the_control_step_is_refused(utn17: Network, step_s: float) -> None:
+    with pytest.raises(SettingError, match=rf"'step_s' is {step_s:g}: it must divide the control step of 120 s"):
+        DistributedMPC(utn17, step_s=step_s)
+
+
+def test_the_model_step_must_divide_the_common_cycle_and_not_each_one(mixed: Network) -> None:
+    assert mixed.control_step_s == 120
+    ask(DistributedMPC(mixed, step_s=120.0, horizon=2))
+    common = retimed(mixed, "common", (60, 0))
+    with pytest.raises(SettingError, match="'step_s' is 120: it must divide the control step of 60 s"):
+        DistributedMPC(common, step_s=120.0)
+
+
+def test_junctions_with_cycles_of_their_own_get_plans_that_fill_them(mixed: Network, cost: str) -> None:
+    rng, mpc = np.random.default_rng(29), DistributedMPC(mixed, cost=cost)
+    for _ in range(5):
+        plan = mpc.plan(some_state(mixed, rng), some_forecast(mixed, rng))
+        assert_admissible(mixed, plan)
+        for junction in mixed.junctions:
+            lost = sum(mixed.stages[stage].clearance_s for stage in junction.stages)
+            for green_s in all_greens(plan):
+                assert green_s[list(junction.stages)].sum() + lost == pytest.approx(junction.cycle_s, abs=1e-3)
+
+
+@pytest.mark.parametrize("step_s", [None, 90.0])
+def test_cycles_whose_common_multiple_is_long_are_planned_for_too(motley: Network, step_s: float | None) -> None:
+    assert motley.control_step_s == 360
+    assert_admissible(motley, ask(DistributedMPC(motley, horizon=2, step_s=step_s)))
+
+
+@pytest.mark.parametrize("step_s", [None, 30.0])
+def test_a_miscount_of_few_vehicles_never_leaves_the_controller_without_a_plan(
+    any_net: Network, step_s: float | None
+) -> None:
+    past = np.zeros((any_net.delay_samples, 17))
     past[0] = 20.0
-    state = replace(
-        some_state(net, np.random.default_rng(0)),
-        x_veh=np.full(17, 20.0 - lost_veh),
-        q_veh=np.zeros(35),
-        past_inflow_veh=past,
-    )
-    plan = DistributedMPC(net).plan(state, Forecast(20.0 * np.tile(net.is_source, (HORIZON, 1))))
-    assert_admissible(net, plan)
+    mpc = DistributedMPC(any_net, horizon=3, step_s=step_s)
+    for lost_veh in (0.1, 1.0, 3.0, 20.0):
+        state = replace(quiet_state(any_net, np.full(17, 20.0 - lost_veh)), past_inflow_veh=past)
+        assert_admissible(any_net, mpc.plan(state, Forecast(np.tile(20.0 * any_net.is_source, (3, 1)))))
 
 
 def test_more_vehicles_than_a_link_holds_never_leave_the_controller_without_a_plan(utn17: Network, cost: str) -> None:
     state = some_state(utn17, np.random.default_rng(0))
     x = 1.2 * utn17.storage_veh
     crowded = replace(state, x_veh=x, q_veh=(x[utn17.turn_link] * utn17.fraction))
-    assert_admissible(utn17, DistributedMPC(utn17, cost=cost).plan(crowded, Forecast(np.full((HORIZON, 17), 60.0))))
+    for step_s in (None, 30.0):
+        mpc = DistributedMPC(utn17, cost=cost, horizon=3, step_s=step_s)
+        assert_admissible(utn17, mpc.plan(crowded, Forecast(np.full((3, 17), 60.0))))
 
 
-def test_an_empty_network_is_planned_for_too(net: Network, cost: str) -> None:
-    nothing = replace(
-        some_state(net, np.random.default_rng(0)),
-        x_veh=np.zeros(17),
-        q_veh=np.zeros(35),
-        source_queue_veh=np.zeros(17),
-        past_inflow_veh=np.zeros((net.delay_steps, 17)),
-    )
-    assert_admissible(net, DistributedMPC(net, cost=cost).plan(nothing, Forecast(np.zeros((HORIZON, 17)))))
+@pytest.mark.parametrize("step_s", [None, 30.0])
+def test_an_empty_network_is_planned_for_too(any_net: Network, cost: str, step_s: float | None) -> None:
+    mpc = DistributedMPC(any_net, cost=cost, horizon=2, step_s=step_s)
+    assert_admissible(any_net, mpc.plan(quiet_state(any_net), Forecast(np.zeros((2, 17)))))
 
 
 def test_a_lone_junction_is_planned_without_neighbours(utn17: Network) -> None:
@@ -292,41 +538,46 @@ def test_a_lone_junction_is_planned_without_neighbours(utn17: Network) -> None:
     assert_admissible(lone, plan)
 
 
-def test_a_shift_moves_what_was_agreed_one_step_up_and_repeats_the_last() -> None:
+def test_a_shift_moves_what_was_agreed_a_control_step_up_and_repeats_the_last() -> None:
     consensus = Consensus(np.array([[1.0, 2.0, 3.0]]), np.array([[4.0, 5.0, 6.0]]), rho=0.1)
-    consensus.shift()
+    consensus.shift(1)
     assert consensus.mean.tolist() == [[2, 3, 3]]
     assert consensus.price.tolist() == [[5, 6, 6]]
+    finer = Consensus(np.arange(1.0, 7.0)[None], np.arange(11.0, 17.0)[None], rho=0.1)
+    finer.shift(2)
+    assert finer.mean.tolist() == [[3, 4, 5, 6, 5, 6]]
+    assert finer.price.tolist() == [[13, 14, 15, 16, 15, 16]]
 
 
+@pytest.mark.parametrize(("step_s", "steps"), [(None, 1), (60.0, 2), (40.0, 3)])
 def test_every_step_starts_from_what_was_agreed_in_the_last_one_shifted(
-    utn17: Network, monkeypatch: pytest.MonkeyPatch
+    utn17: Network, monkeypatch: pytest.MonkeyPatch, step_s: float | None, steps: int
 ) -> None:
-    shifted: list[Consensus] = []
+    shifted: list[int] = []
 
-    def shift(consensus: Consensus) -> None:
-        shifted.append(consensus)
+    def shift(consensus: Consensus, steps: int) -> None:
+        shifted.append(steps)
 
     monkeypatch.setattr(Consensus, "shift", shift)
-    mpc = DistributedMPC(utn17)
-    counts = []
-    for _ in range(3):
+    mpc = DistributedMPC(utn17, step_s=step_s, horizon=2)
+    for asked in range(3):
         ask(mpc)
-        counts.append(len(shifted))
-    assert counts == [0, 1, 2]
+        assert shifted == [steps] * asked
 
 
-def test_a_warm_start_saves_iterations(utn17: Network) -> None:
+@pytest.mark.parametrize("step_s", [120.0, 60.0])
+def test_a_warm_start_saves_iterations(utn17: Network, step_s: float) -> None:
     rng = np.random.default_rng(11)
-    warm = DistributedMPC(utn17, iterations=400)
-    demand = 20.0 * np.tile(utn17.is_source, (HORIZON, 1))
+    chosen = {"iterations": 400, "horizon": 4, "step_s": step_s}
+    warm, model = DistributedMPC(utn17, **chosen), LinkModel(utn17, step_s)
+    forecast = Forecast(np.tile(20.0 * utn17.is_source, (4, 1)))
     state, saved = some_state(utn17, rng), []
-    for cycle in range(5):
-        plan = warm.plan(state, Forecast(demand))
-        if cycle > 0:
-            cold = DistributedMPC(utn17, iterations=400).plan(state, Forecast(demand))
+    for step in range(5):
+        plan = warm.plan(state, forecast)
+        if step > 0:
+            cold = DistributedMPC(utn17, **chosen).plan(state, forecast)
             saved.append(cold.facts["iterations"] - plan.facts["iterations"])
-        after, _ = exact_step(utn17, state, plan.green_s, Forecast(demand))
+        after = Run.of(model, state, plan.green_s, Forecast(forecast.demand_veh[:1])).states[-1]
         state = replace(
             state,
             x_veh=after.x_veh,
@@ -345,6 +596,11 @@ def test_what_the_coordination_did_is_told(utn17: Network) -> None:
     # SPEC 4: at each of nine interactions both sides send Kp numbers of eight bytes.
     assert facts["bytes_exchanged"] == 3 * 2 * 9 * HORIZON * 8
     assert facts["primal_veh"] > 0
+
+
+def test_a_finer_model_step_exchanges_a_number_for_each(utn17: Network) -> None:
+    facts = ask(DistributedMPC(utn17, iterations=3, horizon=2, step_s=30.0)).facts
+    assert facts["bytes_exchanged"] == 3 * 2 * 9 * 2 * 4 * 8
 
 
 class Solver:
@@ -388,7 +644,7 @@ def solver(monkeypatch: pytest.MonkeyPatch) -> type[Solver]:
 
 def ask(mpc: DistributedMPC) -> Plan:
     rng = np.random.default_rng(5)
-    return mpc.plan(some_state(mpc.network, rng), some_forecast(mpc.network, rng))
+    return mpc.plan(some_state(mpc.network, rng), some_forecast(mpc.network, rng, mpc.horizon))
 
 
 @pytest.mark.parametrize("flag", [-1, -2, -3, -4, -5, -6, 0])
@@ -425,9 +681,9 @@ def test_a_controller_that_failed_plans_again_in_the_next_step(utn17: Network, s
     assert_admissible(utn17, ask(mpc))
 
 
-def test_the_way_that_is_left_shrinks_by_a_link_at_every_turn(net: Network) -> None:
-    remaining = remaining_steps(net)
-    own = net.free_time_s / net.control_step_s + 0.5
+def test_the_way_that_is_left_shrinks_by_a_link_at_every_turn(any_net: Network) -> None:
+    net, remaining = any_net, remaining_steps(any_net)
+    own = (net.free_time_s + net.cycle_s[net.link_junction] / 2) / net.control_step_s
     for link in range(len(net.links)):
         turns = [turn for turn in net.turns if turn.link == link and turn.next_link != EXIT]
         onward = sum(turn.fraction * remaining[turn.next_link] for turn in turns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 
@@ -91,6 +92,46 @@ def test_an_unsafe_signal_is_counted_with_its_reason(utn17: Network, record: Pat
     assert verdict.unsafe_signal_s > 0
     assert {junction for junction, _ in verdict.seconds} == {"J1"}
     assert any(line.startswith("J1 at ") and reason in line for line in verdict.reasons)
+
+
+def starting_at(net: Network, offset_s: float) -> Network:
+    """The network with that offset at J1."""
+    return replace(
+        net,
+        junctions=tuple(
+            replace(junction, offset_s=offset_s) if junction.id == "J1" else junction for junction in net.junctions
+        ),
+    )
+
+
+OPENS_WITH_FIVE_SECONDS: Phases = [(FIRST, 5), (YELLOW, 3), (RED, 2), (SECOND, 230)]
+
+
+@pytest.mark.parametrize("offset_s", [0, 120, 240])
+def test_a_cycle_that_begins_at_second_0_has_its_least_green(utn17: Network, record: Path, offset_s: float) -> None:
+    verdict = judge(starting_at(utn17, offset_s), record, OPENS_WITH_FIVE_SECONDS)
+    assert verdict.unsafe_signal_s == 1
+    assert "J1 at 5 s" in verdict.reasons[0]
+    assert "less than its least" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize("offset_s", [10, 119, 130, -110])
+def test_a_green_amid_which_the_run_begins_is_not_accused_of_being_too_short(
+    utn17: Network, record: Path, offset_s: float
+) -> None:
+    assert judge(starting_at(utn17, offset_s), record, OPENS_WITH_FIVE_SECONDS).reasons == []
+
+
+def test_with_an_offset_too_every_later_green_has_its_least(utn17: Network, record: Path) -> None:
+    second_is_short: Phases = [*OPENS_WITH_FIVE_SECONDS[:3], (SECOND, 5), ("rrryyyyrrr", 3), (RED, 222)]
+    verdict = judge(starting_at(utn17, 10), record, second_is_short)
+    assert sorted(verdict.seconds) == [("J1", 15)]
+    assert "less than its least" in verdict.reasons[0]
+
+
+def test_a_green_that_follows_a_red_start_has_its_least_whatever_the_offset(utn17: Network, record: Path) -> None:
+    phases: Phases = [(RED, 3), *OPENS_WITH_FIVE_SECONDS]
+    assert judge(starting_at(utn17, 10), record, phases).seconds == {("J1", 8)}
 
 
 @pytest.mark.parametrize("seconds", [1, 2, 7, 60])

@@ -25,12 +25,14 @@ class Scripted:
         answer = self.answers.pop(0)
         if isinstance(answer, Exception):
             raise answer
-        return answer
+        plan: Plan = answer
+        return plan
 
 
 def asked(net: Network, *answers: Any) -> list[Decision]:
-    links = np.zeros(len(net.links))
-    state = State(0, 0.0, links, np.zeros(len(net.turns)), links, links[None], np.zeros(len(net.turns)))
+    links, turns = np.zeros(len(net.links)), np.zeros(len(net.turns))
+    past = np.zeros((net.delay_samples, len(net.links)))
+    state = State(0, 0.0, links, turns, links, past, turns, net.fraction)
     supervisor = Supervisor(net, Scripted(answers))
     return [supervisor.ask(state, Forecast(links[None])) for _ in answers]
 
@@ -51,7 +53,7 @@ BROKEN: dict[str, tuple[Any, str]] = {
     "divides by zero": (ZeroDivisionError(), "ZeroDivisionError"),
     "returns not a number": (Plan(np.full(17, np.nan)), "not finite"),
     "returns too few": (Plan(np.full(16, 55.0)), "shape (16,)"),
-    "returns words": (Plan(["long"] * 17), "long"),
+    "returns words": (Plan(["long"] * 17), "long"),  # type: ignore[arg-type]
     "returns zeros": (Plan(np.zeros(17)), "least"),
     "returns no plan": (None, "NoneType"),
 }

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from utn_controllers.distributed_mpc.problem import JunctionProblem, QuadraticProgram
+from utn_controllers.distributed_mpc.problem import JunctionProblem, QuadraticProgram, Timing
 from utn_sumo.contract import Floats, Forecast, State
 from utn_sumo.errors import ControllerError
 
@@ -24,7 +24,6 @@ class Agent:
     def __init__(self, problem: JunctionProblem, place: dict[int, int]):
         """`place` gives each interaction (a link that has a producer and a consumer) its row."""
         self.problem = problem
-        horizon = problem.settings.horizon
         consumed, produced = problem.consumed(), problem.produced()
         self.interactions = np.array([place[link] for link in consumed + produced], dtype=np.int64)
         """(n,) rows of the interactions, consumed ones first."""
@@ -35,17 +34,17 @@ class Agent:
         blocks = [problem.inflow_rows(link) for link in consumed] + [problem.outflow_rows(link) for link in produced]
         self._coupling = np.vstack(blocks) if blocks else np.zeros((0, problem.layout.size))
         self._gram = self._coupling.T @ self._coupling
-        self._shape = (len(self.interactions), horizon)
+        self._shape = (len(self.interactions), problem.steps)
         self.program: QuadraticProgram | None = None
         self.solution: Floats = np.zeros(problem.layout.size)
         self._solver: Any = None
         self._rho = 0.0
 
-    def prepare(self, state: State, forecast: Forecast, rho: float) -> None:
+    def prepare(self, state: State, forecast: Forecast, timing: Timing, rho: float) -> None:
         """Take up a new state. The Hessian is factorised once for each `rho`; later states only bring vectors
         and the constraint matrix, and the solver starts from the last active set.
         """
-        self.program = self.problem.program(state, forecast)
+        self.program = self.problem.program(state, forecast, timing)
         if self._solver is None or rho != self._rho:
             self.factorise(rho)
         else:
@@ -72,9 +71,9 @@ class Agent:
         return self.program
 
     def solve(self, mean: Floats, price: Floats) -> Floats:
-        """Best answer to the interactions' means and prices; (n, Kp) copies of their flows [veh].
+        """Best answer to the interactions' means and prices; (n, model steps) copies of their flows [veh].
 
-        `mean` and `price` (n, Kp) are zb and lam of this agent's interactions.
+        `mean` and `price` (n, model steps) are zb and lam of this agent's interactions.
         """
         linear = (self.sign[:, None] * price - self._rho * mean).ravel()
         gradient = self._program().gradient + self._coupling.T @ linear

@@ -27,17 +27,17 @@ class Consensus:
     """What the agents agree on, kept warm from one control step to the next."""
 
     mean: Floats
-    """(interactions, Kp) zb [veh]."""
+    """(interactions, model steps) zb [veh]."""
     price: Floats
-    """(interactions, Kp) lam."""
+    """(interactions, model steps) lam."""
     rho: float
     frozen: bool = False
     """Whether rho has settled."""
 
-    def shift(self) -> None:
-        """One control step on: everything moves up by a step, and the last one is repeated."""
+    def shift(self, steps: int) -> None:
+        """One control step of so many model steps on: everything moves up by it, and the last one is repeated."""
         for array in (self.mean, self.price):
-            array[:, :-1] = array[:, 1:]
+            array[:, :-steps] = array[:, steps:].copy()
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,25 @@
 """The MPC of SPEC 3 and 4, stated once in CasADi for one junction, as a convex quadratic programme.
 
-The model is SPEC 2 with its minimum relaxed: the leaving flow is at most each of the three terms, and the delay is
-frozen at its present value. The whole network's problem is the sum of these problems under `inflow of a link as
-its consumer has it = outflow to it as its producer has it`, which is what the agents coordinate.
+The model is SPEC 2 with its minimum relaxed: the leaving flow is at most each of the three terms. Frozen are the
+delay, at its present value, and where in the cycle the green stands, at what was planned last (`Timing`). The whole
+network's problem is the sum of these problems under `inflow of a link as its consumer has it = outflow to it as its
+producer has it`, which is what the agents coordinate.
 
-Everything is in veh per control step and, for the cost, veh times control steps. CasADi derives Hessian and
+Everything is in veh per model step and, for the cost, veh times control steps. CasADi derives Hessian and
 constraint matrix once; the loop then only evaluates numbers.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from utn_controllers.distributed_mpc.settings import Settings
-from utn_sumo.contract import Floats, Forecast, Network, State
-from utn_sumo.model import CasadiOperations, LinkModel
+from utn_sumo.contract import Floats, Forecast, Ints, Network, State
+from utn_sumo.model import CasadiOperations, LinkModel, green_windows
 
 REGULARISATION = 1e-3
 """Weight of the squared flows: makes the Hessian definite and the plan unique; 1e-3 veh a step at 1 veh."""
@@ -49,9 +50,9 @@ class Layout:
     size: int
 
     @classmethod
-    def of(cls, part: Network, settings: Settings) -> Layout:
-        """The layout for one junction's part of a network."""
-        steps, links = settings.horizon, len(part.links)
+    def of(cls, part: Network, settings: Settings, steps: int) -> Layout:
+        """The layout for one junction's part of a network, over so many model steps."""
+        links = len(part.links)
         start = 0
 
         def block(rows: int, columns: int) -> npt.NDArray[np.int64]:
@@ -64,12 +65,61 @@ class Layout:
         return cls(green, leaving, inflow, over, size=start)
 
 
+@dataclass(frozen=True)
+class Timing:
+    """Where the green stands in the model steps of a control step, at the greens that it was made from."""
+
+    shown: Floats
+    """(n, S) seconds of green in each model step for a second of the planned green."""
+    end_s: Floats
+    """(n, M) when each turn's last green ends, from the model step's start."""
+    opening: Floats
+    """(n, M) share of what leaves in a model step whose room reaches the link's entry within it."""
+
+    @classmethod
+    def of(cls, model: LinkModel, green_s: Floats) -> Timing:
+        """The timing of the plan `green_s` (S,) on the model's network and step."""
+        windows = green_windows(model.network, green_s, model.step_s)
+        opening = model.opening(windows.shown_s @ model.network.serves, windows.end_s)
+        return cls(windows.shown_s / green_s, windows.end_s, opening)
+
+
+@dataclass(frozen=True)
+class _Past:
+    """Who entered before now, and when they reach their queues after a delay that stays what it is."""
+
+    model: LinkModel
+    delay_s: Floats
+    inflow_veh: tuple[Floats, ...]
+    """(Z,) of each past sample, newest first."""
+
+    @property
+    def by_turn(self) -> Ints:
+        return self.model.network.turn_link
+
+    def still_veh(self) -> Floats:
+        """(Z,) vehicles on the way now."""
+        share = self.model.on_the_way(self.delay_s, 0.0)[1:]
+        return np.asarray(sum(part * inflow for part, inflow in zip(share, self.inflow_veh, strict=True)))
+
+    def still_by_turn_veh(self, at_s: Floats) -> Floats:
+        """(M,) vehicles of each turn's link still on the way `at_s` (M,) from now."""
+        share = self.model.on_the_way(self.delay_s[self.by_turn], at_s)[1:]
+        veh = sum(part * inflow[self.by_turn] for part, inflow in zip(share, self.inflow_veh, strict=True))
+        return np.asarray(veh)
+
+    def at_most(self, moving_veh: Floats) -> _Past:
+        """With no more on the way than `moving_veh` (Z,): a miscount would leave the first step no feasible flow."""
+        scale = np.minimum(1.0, moving_veh / np.maximum(self.still_veh(), 1e-9))
+        return replace(self, inflow_veh=tuple(scale * inflow for inflow in self.inflow_veh))
+
+
 def remaining_steps(network: Network) -> Floats:
     """(Z,) control steps that a vehicle on each link still needs to leave the network.
 
     Free travel and half a cycle's wait on each link of its expected way, summed by the turning fractions.
     """
-    own = network.free_time_s / network.control_step_s + 0.5
+    own = (network.free_time_s + network.cycle_s[network.link_junction] / 2) / network.control_step_s
     fed = np.flatnonzero(network.turn_next >= 0)
     onward = np.zeros((len(network.links), len(network.links)))
     np.add.at(onward, (network.turn_link[fed], network.turn_next[fed]), network.fraction[fed])
@@ -87,11 +137,16 @@ class JunctionProblem:
         self.links = np.flatnonzero(network.link_junction == junction)
         self.turns = np.flatnonzero(np.isin(network.turn_link, self.links))
         self.stages = np.array(network.junctions[junction].stages)
-        self.layout = Layout.of(self.part, settings)
-        self.model = LinkModel(self.part, network.control_step_s, CasadiOperations())
-        self._numbers = LinkModel(self.part, network.control_step_s)
-        self._lags = network.delay_steps
-        self.model.lags = self._numbers.lags = self._lags
+        step_s = settings.step_s or network.control_step_s
+        self.substeps = round(network.control_step_s / step_s)
+        """Model steps of a control step (n)."""
+        self.steps = settings.horizon * self.substeps
+        """Model steps of the horizon."""
+        self.layout = Layout.of(self.part, settings, self.steps)
+        self.model = LinkModel(self.part, step_s, CasadiOperations())
+        self._numbers = LinkModel(self.part, step_s)
+        self._lags = int(np.ceil(self.part.free_time_s.max() / step_s))
+        """Model steps back from which somebody can still be on the way."""
         self._remaining = remaining_steps(network)[self.links]
         self._bind(self._state_problem())
 
@@ -104,41 +159,41 @@ class JunctionProblem:
         return sorted({int(link) for link in self.network.turn_next[self.turns] if link >= 0})
 
     def inflow_rows(self, link: int) -> Floats:
-        """(Kp, n) matrix that picks the consumer's copy of the inflow of one of its links."""
-        rows = np.zeros((self.settings.horizon, self.layout.size))
+        """(model steps, variables) matrix that picks the consumer's copy of the inflow of one of its links."""
+        rows = np.zeros((self.steps, self.layout.size))
         position = int(np.flatnonzero(self.links == link)[0])
-        rows[np.arange(self.settings.horizon), self.layout.inflow[:, position]] = 1
+        rows[np.arange(self.steps), self.layout.inflow[:, position]] = 1
         return rows
 
     def outflow_rows(self, link: int) -> Floats:
-        """(Kp, n) matrix that adds up the flows of this junction into `link`."""
-        rows = np.zeros((self.settings.horizon, self.layout.size))
+        """(model steps, variables) matrix that adds up the flows of this junction into `link`."""
+        rows = np.zeros((self.steps, self.layout.size))
         for position in np.flatnonzero(self.network.turn_next[self.turns] == link):
-            rows[np.arange(self.settings.horizon), self.layout.leaving[:, position]] = 1
+            rows[np.arange(self.steps), self.layout.leaving[:, position]] = 1
         return rows
 
-    def program(self, state: State, forecast: Forecast) -> QuadraticProgram:
-        """The quadratic programme for this state."""
-        q = state.q_veh[self.turns]
-        queue = self._numbers.leaves @ q
-        share = self._numbers.on_the_way(self._numbers.delay_s(queue))
-        # A miscount must not leave more on the way than there is: the first step would have no feasible flow.
-        past = state.past_inflow_veh[: self._lags, self.links]
-        still = np.sum([part * inflow for part, inflow in zip(share[1:], past, strict=False)], axis=0)
-        moving = np.maximum(state.x_veh[self.links] - queue, 0.0)
-        past = past * np.minimum(1.0, moving / np.maximum(still, 1e-9))
-        parameters = np.concatenate(
-            [
-                state.x_veh[self.links],
-                q,
-                state.source_queue_veh[self.links],
-                past.ravel(),
-                forecast.demand_veh[: self.settings.horizon, self.links].ravel(),
-                np.concatenate(share),
-                self.network.fraction[self.turns],
-            ]
-        )
-        self._parameters[:] = parameters
+    def program(self, state: State, forecast: Forecast, timing: Timing) -> QuadraticProgram:
+        """The quadratic programme for this state, the greens standing where `timing` has them."""
+        model, step_s = self._numbers, self._numbers.step_s
+        x, q = state.x_veh[self.links], state.q_veh[self.turns]
+        queue = model.leaves @ q
+        delay_s = model.delay_s(queue)
+        past = _Past(model, delay_s, model.history(state.past_inflow_veh[:, self.links], self.network.sample_s))
+        past = past.at_most(np.maximum(x - queue, 0.0))
+        ends = timing.end_s[:, self.turns]
+        lags = np.arange(self._lags + 1)[:, None]
+        parameters: list[Any] = [
+            x,
+            q,
+            state.source_queue_veh[self.links],
+            np.repeat(forecast.demand_veh[: self.settings.horizon, self.links], self.substeps, 0) / self.substeps,
+            state.fraction[self.turns],
+            [np.clip((delay_s[past.by_turn] - end) / step_s + 1.0 - lags, 0.0, 1.0) for end in ends],
+            [past.still_by_turn_veh(step * step_s + ends[step % self.substeps]) for step in range(self._lags)],
+            timing.shown[:, self.stages],
+            timing.opening[:, self.turns],
+        ]
+        self._parameters[:] = np.concatenate([np.ravel(part) for part in parameters])
         self._run()
         constant = float(self._results[-1][0])
         hessian, gradient, matrix, lower, upper = (array.copy() for array in self._results[:-1])
@@ -191,19 +246,21 @@ class JunctionProblem:
         """The problem's parameters, in the order in which `program` fills them in; lists run over steps or lags."""
         import casadi as ca  # noqa: PLC0415 - heavy
 
-        links, turns = len(self.part.links), len(self.part.turns)
+        links, turns, stages = len(self.part.links), len(self.part.turns), len(self.part.stages)
 
-        def over(name: str, count: int) -> list[Any]:
-            return [ca.SX.sym(f"{name}{index}", links) for index in range(count)]
+        def over(name: str, count: int, size: int) -> list[Any]:
+            return [ca.SX.sym(f"{name}{index}", size) for index in range(count)]
 
         return {
             "x": ca.SX.sym("x", links),
             "q": ca.SX.sym("q", turns),
             "waiting": ca.SX.sym("waiting", links),
-            "past": over("past", self._lags),
-            "demand": over("demand", self.settings.horizon),
-            "share": over("share", self._lags),
+            "demand": over("demand", self.steps, links),
             "fraction": ca.SX.sym("fraction", turns),
+            "share_in_green": over("share_in_green", self.substeps * (self._lags + 1), turns),
+            "still_in_green": over("still_in_green", self._lags, turns),
+            "shown": over("shown", self.substeps, stages),
+            "opening": over("opening", self.substeps, turns),
         }
 
     def _predict(
@@ -213,10 +270,12 @@ class JunctionProblem:
         x: Any,
         q: Any,
         waiting: Any,
-        past: list[Any],
         demand: list[Any],
-        share: list[Any],
         fraction: Any,
+        share_in_green: list[Any],
+        still_in_green: list[Any],
+        shown: list[Any],
+        opening: list[Any],
     ) -> tuple[Any, list[tuple[Any, float, float]]]:
         """The horizon: (cost, rows), a row being (expression, lower, upper)."""
         import casadi as ca  # noqa: PLC0415 - heavy
@@ -224,31 +283,38 @@ class JunctionProblem:
         settings, part, model, layout = self.settings, self.part, self.model, self.layout
         by_link = model.operations.matmul
         serves, source = part.serves.T.astype(float), part.is_source.astype(float)
-        budget_s = float(part.green_budget_s[0])
+        budget_s, lags = float(part.green_budget_s[0]), self._lags + 1
         cost: Any = 0
         rows = [(ca.sum1(z[green]), budget_s, budget_s) for green in layout.green]
-        for step in range(settings.horizon):
-            green = z[layout.green[min(step, settings.control_horizon - 1)]]
+        inflows: list[Any] = []
+        for step in range(self.steps):
+            control_step, substep = divmod(step, self.substeps)
+            green = z[layout.green[min(control_step, settings.control_horizon - 1)]]
             leaving, inflow, over = z[layout.leaving[step]], z[layout.inflow[step]], z[layout.over_storage[step]]
-            moving = x - by_link(model.leaves, q)
-            arriving = model.arriving_veh(moving, inflow, past, share)
-            unsaturated = q + fraction * by_link(model.leaves.T, arriving)
-            saturated = model.saturated_veh(by_link(serves, green), fraction)
+            inflows = [inflow, *inflows][:lags]
+            # Who can be in the queue before the green ends: everybody but those still on the way then. q holds who was
+            # queued at first less who left; when who arrives joins it makes no difference to the sum.
+            in_time = by_link(model.leaves.T, x - by_link(model.leaves, q) + inflow)
+            if step < self._lags:
+                in_time = in_time - still_in_green[step]
+            for lag, entered in enumerate(inflows):
+                in_time = in_time - share_in_green[substep * lags + lag] * by_link(model.leaves.T, entered)
+            saturated = model.saturated_veh(by_link(serves, green * shown[substep]), fraction)
+            room = model.room_veh(x) + by_link(model.leaves, opening[substep] * leaving)
             # The three terms of SPEC 2.3, the third as the consumer's: it knows its storage.
             rows += [
-                (leaving - unsaturated, -np.inf, 0.0),
+                (leaving - q - fraction * in_time, -np.inf, 0.0),
                 (leaving - saturated, -np.inf, 0.0),
-                (inflow - over - model.room_veh(x), -np.inf, 0.0),
+                (inflow - over - room, -np.inf, 0.0),
             ]
-            q = unsaturated - leaving
+            q = q - leaving
             x = x + inflow - by_link(model.leaves, leaving)
             waiting = waiting + source * (demand[step] - inflow)
             rows += [(waiting[int(link)], 0.0, np.inf) for link in np.flatnonzero(part.is_source)]
-            past = [inflow, *past[:-1]]
-            cost += settings.stage_cost(x, waiting, part) + STORAGE_PENALTY * ca.sum1(over)
+            part_of_step = settings.stage_cost(x, waiting, part) + STORAGE_PENALTY * ca.sum1(over)
+            cost += part_of_step / self.substeps
             cost += REGULARISATION / 2 * (ca.sumsqr(leaving) + ca.sumsqr(inflow) + ca.sumsqr(over))
-            if step < settings.control_horizon:
-                cost += settings.green_cost(green)
+        cost += sum(settings.green_cost(z[green]) for green in layout.green)
         return cost + settings.terminal_cost(x, waiting, self._remaining), rows
 
     def _simple_bounds(self) -> tuple[Floats, Floats]:

@@ -18,6 +18,8 @@ class Settings(BaseModel):
     """Kp, control steps predicted."""
     control_horizon: int = Field(4, ge=1, le=60)
     """Kc, control steps in which the greens may change, held after it; 4, or Kp where that is less."""
+    step_s: float | None = Field(None, gt=0)
+    """Step of the prediction's model; a divisor of the control step, by default all of it."""
     cost: Literal["tts", "paper"] = "tts"
     q: float = Field(0.1, ge=0)
     """Q of the paper's cost: weight of x^2."""

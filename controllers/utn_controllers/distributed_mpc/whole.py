@@ -9,13 +9,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from utn_controllers.distributed_mpc.problem import JunctionProblem
+from utn_controllers.distributed_mpc.problem import JunctionProblem, Timing
 from utn_sumo.contract import Floats, Forecast, State
 from utn_sumo.errors import ControllerError
 
 
 def optimum(
-    problems: Sequence[JunctionProblem], state: State, forecast: Forecast, greens: Floats | None = None
+    problems: Sequence[JunctionProblem],
+    state: State,
+    forecast: Forecast,
+    timing: Timing,
+    greens: Floats | None = None,
 ) -> tuple[float, list[Floats]]:
     """Least cost of the whole network and each junction's solution.
 
@@ -25,7 +29,7 @@ def optimum(
     import piqp  # noqa: PLC0415 - compiled, loaded at use
     import scipy.sparse as sp  # noqa: PLC0415 - heavy
 
-    programs = [problem.program(state, forecast) for problem in problems]
+    programs = [problem.program(state, forecast, timing) for problem in problems]
     sizes = [problem.layout.size for problem in problems]
     starts = np.concatenate([[0], np.cumsum(sizes)])
     lower_box = np.concatenate([program.lower[:size] for program, size in zip(programs, sizes, strict=True)])
@@ -68,8 +72,7 @@ def _coupling(problems: Sequence[JunctionProblem], starts: Floats) -> Floats:
     producer = {link: place for place, problem in enumerate(problems) for link in problem.produced()}
     blocks = []
     for link, place in sorted(consumer.items()):
-        horizon = problems[place].settings.horizon
-        block = np.zeros((horizon, int(starts[-1])))
+        block = np.zeros((problems[place].steps, int(starts[-1])))
         for owner, rows, sign in (
             (place, problems[place].inflow_rows(link), 1.0),
             (producer[link], problems[producer[link]].outflow_rows(link), -1.0),

@@ -18,12 +18,10 @@ from typing import Any, Self
 import numpy as np
 
 from utn_sumo import detectors
-from utn_sumo.contract import Floats, Measurement, Network, Plan
+from utn_sumo.contract import SAMPLE_S, Floats, Measurement, Network, Plan
 from utn_sumo.errors import PlantError
 from utn_sumo.signals import cycle_phases
 
-SAMPLE_S = 10.0
-"""Rhythm in which the true state is sampled for the record (the paper's sampling interval)."""
 PROGRAM = "utn"
 
 
@@ -64,6 +62,8 @@ class SumoPlant:
         """Wall time spent inside SUMO: start, steps, close."""
         self.truth: Truth | None = None
         self._ids = detectors.ids(network)
+        self._entered: list[tuple[float, Floats]] = []
+        """(time, what the entry loops have counted since the control step began) at each reading."""
         self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
         self._sumo: Any = None
 
@@ -114,6 +114,7 @@ class SumoPlant:
         peak_queue = np.zeros(len(self.network.links))
         try:
             spent_veh_s = 0.0
+            self._entered = [(self.time_s, np.zeros(len(self.network.links)))]
             while self.time_s < end_s:
                 before_s = self.time_s
                 for index, boundary_s in enumerate(self._boundary_s):
@@ -123,6 +124,7 @@ class SumoPlant:
                 sample_s = (self.time_s // SAMPLE_S + 1) * SAMPLE_S
                 self.time_s = min([sample_s, end_s, *self._boundary_s])
                 self._step()
+                self._entered.append((self.time_s, self._entered_so_far()))
                 x_veh = self._by_edge(self._sumo.edge.getLastStepVehicleNumber)
                 np.maximum(peak_x, x_veh, out=peak_x)
                 waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
@@ -138,17 +140,29 @@ class SumoPlant:
             raise PlantError(f"SUMO broke off at {self.time_s:g} s ({_first_line(error)})") from error
 
     def redraw(self, onward: Callable[[int], list[str]], rng: np.random.Generator, speed_share: float) -> None:
-        """Give every vehicle on the road a new future: another way after its next junction, a slightly other speed.
+        """Give every vehicle on the road a new future: another way, and a slightly other speed.
 
+        The way is new from the next junction on for those that are still before the reach of its lane-area detectors;
+        for those within it from the junction after that, since the lane that they are in has settled the turn.
         `onward` draws the edges from the start of a link to an exit.
         """
-        vehicles = self._sumo.vehicle
-        first_edge = {link.edges[0]: index for index, link in enumerate(self.network.links)}
+        vehicles, network = self._sumo.vehicle, self.network
+        first_edge = {link.edges[0]: index for index, link in enumerate(network.links)}
         for name in sorted(vehicles.getIDList()):
-            route, at = vehicles.getRoute(name), vehicles.getRouteIndex(name)
-            ahead = next((place for place in range(at + 1, len(route)) if route[place] in first_edge), None)
-            if ahead is not None:
-                vehicles.setRoute(name, [*route[at:ahead], *onward(first_edge[route[ahead]])])
+            route, at = list(vehicles.getRoute(name)), vehicles.getRouteIndex(name)
+            ahead = next((place for place in range(at + 1, len(route)) if route[place] in first_edge), len(route))
+            start = next((place for place in range(at, -1, -1) if route[place] in first_edge), None)
+            edges = route[at:ahead]
+            if start is not None:
+                link = network.links[first_edge[route[start]]]
+                rest_m = sum(network.edge_length_m[edge] for edge in link.edges[at - start :])
+                to_stop_m = rest_m - vehicles.getLanePosition(name)
+                on_edge = vehicles.getRoadID(name) == route[at]
+                if on_edge and to_stop_m > detectors.AREA_REACH_M:
+                    vehicles.setRoute(name, onward(first_edge[route[start]])[at - start :])
+                    edges = []
+            if edges and ahead < len(route):
+                vehicles.setRoute(name, [*edges, *onward(first_edge[route[ahead]])])
             factor = vehicles.getSpeedFactor(name) * (1 + speed_share * rng.standard_normal())
             vehicles.setSpeedFactor(name, factor)
 
@@ -169,29 +183,46 @@ class SumoPlant:
     def _by_edge(self, getter: Any) -> Floats:
         return np.array([float(sum(map(getter, link.edges))) for link in self.network.links])
 
+    def _interval(self) -> tuple[Any, Any]:
+        """Getters of a loop's count and occupancy [%] over the present control step, until now.
+
+        At the step's end its interval has just closed; before it, what the interval has so far is meant.
+        """
+        loop = self._sumo.inductionloop
+        if self.time_s % self.network.control_step_s == 0:
+            return loop.getLastIntervalVehicleNumber, loop.getLastIntervalOccupancy
+        return loop.getIntervalVehicleNumber, loop.getIntervalOccupancy
+
+    def _entered_so_far(self) -> Floats:
+        return _total(self._interval()[0], self._ids.entry)
+
     def _measure(self) -> Measurement:
-        loop, area = self._sumo.inductionloop, self._sumo.lanearea
-
-        def total(getter: Any, groups: Sequence[Sequence[str]]) -> Floats:
-            return np.array([float(sum(map(getter, group))) for group in groups])
-
-        # A run may end amid an interval; then what the interval has so far is the count of its last, short step.
-        whole = self.time_s % self.network.control_step_s == 0
-        counted = loop.getLastIntervalVehicleNumber if whole else loop.getIntervalVehicleNumber
-        covered = loop.getLastIntervalOccupancy if whole else loop.getIntervalOccupancy
+        area = self._sumo.lanearea
+        counted, covered = self._interval()
 
         def occupancy(groups: Sequence[Sequence[str]]) -> Floats:
-            return np.asarray(total(covered, groups) / (100 * np.array([len(group) for group in groups])))
+            return np.asarray(_total(covered, groups) / (100 * np.array([len(group) for group in groups])))
 
+        times, readings = zip(*self._entered, strict=True)
+        # A loop takes back whom it has counted standing if they change lanes on it: the later reading holds.
+        entered = np.minimum.accumulate(np.array(readings)[::-1])[::-1]
+        start_s = times[0]
+        edges_s = start_s + self.network.sample_s * np.arange(self.network.samples + 1)
+        by_sample = [np.diff(np.interp(edges_s, times, column)) for column in entered.T]
         return Measurement(
             time_s=self.time_s,
-            entered_veh=total(counted, self._ids.entry),
-            turned_veh=total(counted, self._ids.turn),
-            queue_veh=total(area.getLastStepHaltingNumber, self._ids.area),
-            seen_veh=total(area.getLastStepVehicleNumber, self._ids.area),
+            entered_veh=np.array(by_sample).T,
+            turned_veh=_total(counted, self._ids.turn),
+            queue_veh=_total(area.getLastStepHaltingNumber, self._ids.area),
+            seen_veh=_total(area.getLastStepVehicleNumber, self._ids.area),
             entry_occupancy=occupancy(self._ids.entry),
             stop_line_occupancy=occupancy(self._ids.stop_line),
         )
+
+
+def _total(getter: Any, groups: Sequence[Sequence[str]]) -> Floats:
+    """The sum of a getter over each group of detectors."""
+    return np.array([float(sum(map(getter, group))) for group in groups])
 
 
 def write_outputs(path: Path) -> None:
