@@ -63,6 +63,10 @@ class Estimator:
         hidden_samples = np.maximum(length_m - AREA_REACH_M, 0) / speed_m_s / network.sample_s
         self._hidden = np.clip(hidden_samples - np.arange(known.delay_samples)[:, None], 0.0, 1.0)
         """(H, Z) share of each past sample's inflow that has not come into view, on a free road."""
+        same_link = network.turn_link[:, None] == network.turn_link
+        same_green = (network.serves[:, :, None] == network.serves[:, None, :]).all(axis=0)
+        self._together = (same_link & same_green).astype(float)
+        """(M, M) 1 where two turns of a link always have green together: sums by such group."""
         self._free_cover_s = np.full(links, np.nan)
         """(Z,) time that a vehicle covers the loops at a source's entry when nothing holds it up."""
         self._cycle = 0
@@ -106,12 +110,18 @@ class Estimator:
         self._x_veh = np.clip(x + gain[:, 0] * residual, seen.seen_veh, seen.seen_veh + unwatched_veh)
 
     def _queue(self, seen: Measurement) -> None:
-        """q: standing in view, and all beyond the view where the view stands full; by turn as they came and went."""
+        """q: standing in view, and all beyond the view where the view stands full.
+
+        By turn: what has green at the same times leaves in the order in which it came, so who is left has turns like
+        any other arrivals, whatever the last ones happened to choose; between signals with other times, who came
+        and who went is kept count of.
+        """
         beyond = np.where(seen.queue_veh >= FULL_SHARE * self._watched_veh, self._x_veh - seen.seen_veh, 0.0)
         queue = np.minimum(seen.queue_veh + beyond, self._x_veh)
         fraction, link = self._fraction(), self.network.turn_link
         arrived = np.maximum(queue - self._by_link(self._q_veh) + self._by_link(seen.turned_veh), 0.0)
-        split = np.maximum(self._q_veh + fraction * arrived[link] - seen.turned_veh, 0.0)
+        split = self._together @ (self._q_veh + fraction * arrived[link] - seen.turned_veh)
+        split = np.maximum(split, 0.0) * fraction / (self._together @ fraction)
         total = self._by_link(split)[link]
         self._q_veh = np.where(total > 0, split / np.maximum(total, 1e-9), fraction) * queue[link]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -257,35 +258,32 @@ class TestQueues:
         state = Estimator(utn17, known).update(standing, nobody(utn17))
         assert state.q_veh == pytest.approx(20 * known.fraction)
 
-    def test_who_was_served_is_no_longer_queued(self, utn17: Network) -> None:
+    def test_who_is_left_in_a_queue_turns_like_any_other(self, utn17: Network) -> None:
         estimator = Estimator(utn17, utn17)
         queue = each(utn17, 20.0)
         before = estimator.update(counted(utn17, entered=queue, seen_veh=queue, queue_veh=queue), nobody(utn17))
-        exits = utn17.turn_next == EXIT
-        gone = np.where(exits, before.q_veh, 0)
+        gone = np.where(utn17.turn_next == EXIT, before.q_veh, 0)
         rest = queue - by_link(utn17, gone)
-        seen = counted(utn17, turned_veh=gone, seen_veh=rest, queue_veh=rest)
-        state = estimator.update(seen, nobody(utn17))
-        assert state.q_veh[exits] == pytest.approx(0, abs=1e-6)
-        assert state.q_veh[~exits] == pytest.approx(before.q_veh[~exits])
+        after = estimator.update(counted(utn17, turned_veh=gone, seen_veh=rest, queue_veh=rest), nobody(utn17))
+        # That those at the front happened to leave the network says nothing about those behind them.
+        assert after.q_veh == pytest.approx(after.fraction * rest[utn17.turn_link])
 
-
-def shifted(net: Network, share: float) -> Floats:
-    """Turning fractions of which the largest of each link has given `share` to the smallest."""
-    fraction = net.fraction.copy()
-    for link in range(len(net.links)):
-        turns = np.flatnonzero(net.turn_link == link)
-        order = turns[np.argsort(fraction[turns])]
-        fraction[[order[0], order[-1]]] += np.array([share, -share])
-    return fraction
-
-
-def turning(net: Network, fraction: Floats) -> Network:
-    """The network with these turning fractions."""
-    turns = tuple(
-        dataclasses.replace(turn, fraction=float(value)) for turn, value in zip(net.turns, fraction, strict=True)
-    )
-    return dataclasses.replace(net, turns=turns)
+    def test_a_turn_whose_own_signal_served_it_is_no_longer_queued(self, utn17: Network) -> None:
+        link = utn17.link_index("4")
+        onward, leaving = (int(turn) for turn in np.flatnonzero(utn17.turn_link == link))
+        first, second = utn17.junctions[1].stages
+        apart = list(utn17.stages)
+        apart[first] = replace(apart[first], turns=(onward,))
+        apart[second] = replace(apart[second], turns=(leaving, *apart[second].turns))
+        net = replace(utn17, stages=tuple(apart))
+        estimator = Estimator(net, net)
+        queue = each(net, 20.0)
+        before = estimator.update(counted(net, entered=queue, seen_veh=queue, queue_veh=queue), nobody(net))
+        gone = np.where(np.arange(len(net.turns)) == leaving, before.q_veh, 0)
+        rest = queue - by_link(net, gone)
+        after = estimator.update(counted(net, turned_veh=gone, seen_veh=rest, queue_veh=rest), nobody(net))
+        assert after.q_veh[leaving] == pytest.approx(0, abs=1e-6)
+        assert after.q_veh[onward] == pytest.approx(before.q_veh[onward])
 
 
 class TestTurning:
