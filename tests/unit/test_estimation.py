@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -273,9 +272,9 @@ class TestQueues:
         onward, leaving = (int(turn) for turn in np.flatnonzero(utn17.turn_link == link))
         first, second = utn17.junctions[1].stages
         apart = list(utn17.stages)
-        apart[first] = replace(apart[first], turns=(onward,))
-        apart[second] = replace(apart[second], turns=(leaving, *apart[second].turns))
-        net = replace(utn17, stages=tuple(apart))
+        apart[first] = dataclasses.replace(apart[first], turns=(onward,))
+        apart[second] = dataclasses.replace(apart[second], turns=(leaving, *apart[second].turns))
+        net = dataclasses.replace(utn17, stages=tuple(apart))
         estimator = Estimator(net, net)
         queue = each(net, 20.0)
         before = estimator.update(counted(net, entered=queue, seen_veh=queue, queue_veh=queue), nobody(net))
@@ -284,6 +283,24 @@ class TestQueues:
         after = estimator.update(counted(net, turned_veh=gone, seen_veh=rest, queue_veh=rest), nobody(net))
         assert after.q_veh[leaving] == pytest.approx(0, abs=1e-6)
         assert after.q_veh[onward] == pytest.approx(before.q_veh[onward])
+
+
+def shifted(net: Network, share: float) -> Floats:
+    """Turning fractions of which the largest of each link has given `share` to the smallest."""
+    fraction = net.fraction.copy()
+    for link in range(len(net.links)):
+        turns = np.flatnonzero(net.turn_link == link)
+        order = turns[np.argsort(fraction[turns])]
+        fraction[[order[0], order[-1]]] += np.array([share, -share])
+    return fraction
+
+
+def turning(net: Network, fraction: Floats) -> Network:
+    """The network with these turning fractions."""
+    turns = tuple(
+        dataclasses.replace(turn, fraction=float(value)) for turn, value in zip(net.turns, fraction, strict=True)
+    )
+    return dataclasses.replace(net, turns=turns)
 
 
 class TestTurning:
