@@ -81,8 +81,8 @@ class Estimator:
         newest_first = np.vstack([seen.entered_veh[::-1], self._past_inflow_veh])
         self._past_inflow_veh = newest_first[: len(self._past_inflow_veh)]
         self._count(seen, entered)
-        self._queue(seen)
         self._turn(seen.turned_veh)
+        self._queue(seen)
         self._wait_outside(seen, entered, expected_veh)
         self._cycle += 1
         return self._state(seen.time_s, seen.turned_veh)
