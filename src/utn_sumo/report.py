@@ -112,7 +112,7 @@ def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
     for result in results:
         title = (
             "{controller} on {net}, demand {demand:g}, {n} seeds, model step {step_s:g} s, demand {inputs}, "
-            "turning by fractions"
+            "turning {turning}"
         ).format(n=len(result["seeds"]), **result)
         view = Table(title=title, title_justify="left")
         heads = {
