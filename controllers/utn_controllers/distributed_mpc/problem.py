@@ -11,14 +11,14 @@ constraint matrix once; the loop then only evaluates numbers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from utn_controllers.distributed_mpc.settings import Settings
-from utn_sumo.contract import Floats, Forecast, Ints, Network, State
+from utn_sumo.contract import Floats, Forecast, Network, State
 from utn_sumo.model import CasadiOperations, LinkModel, green_windows
 
 REGULARISATION = 1e-3
@@ -88,30 +88,17 @@ class Timing:
 class _Past:
     """Who entered before now, and when they reach their queues after a delay that stays what it is."""
 
-    model: LinkModel
+    inflow_veh: Floats
+    """(H, n) of each past sample, newest first; by link or by turn."""
     delay_s: Floats
-    inflow_veh: tuple[Floats, ...]
-    """(Z,) of each past sample, newest first."""
+    """(n,)"""
+    sample_s: float
 
-    @property
-    def by_turn(self) -> Ints:
-        return self.model.network.turn_link
-
-    def still_veh(self) -> Floats:
-        """(Z,) vehicles on the way now."""
-        share = self.model.on_the_way(self.delay_s, 0.0)[1:]
-        return np.asarray(sum(part * inflow for part, inflow in zip(share, self.inflow_veh, strict=True)))
-
-    def still_by_turn_veh(self, at_s: Floats) -> Floats:
-        """(M,) vehicles of each turn's link still on the way `at_s` (M,) from now."""
-        share = self.model.on_the_way(self.delay_s[self.by_turn], at_s)[1:]
-        veh = sum(part * inflow[self.by_turn] for part, inflow in zip(share, self.inflow_veh, strict=True))
-        return np.asarray(veh)
-
-    def at_most(self, moving_veh: Floats) -> _Past:
-        """With no more on the way than `moving_veh` (Z,): a miscount would leave the first step no feasible flow."""
-        scale = np.minimum(1.0, moving_veh / np.maximum(self.still_veh(), 1e-9))
-        return replace(self, inflow_veh=tuple(scale * inflow for inflow in self.inflow_veh))
+    def still_veh(self, at_s: Any) -> Floats:
+        """(n,) vehicles still on the way `at_s` from now: SPEC 2.5 as in `LinkModel.on_the_way`."""
+        lags = np.arange(len(self.inflow_veh))[:, None]
+        share = np.clip((self.delay_s - at_s) / self.sample_s - lags, 0.0, 1.0)
+        return np.asarray((share * self.inflow_veh).sum(axis=0))
 
 
 def remaining_steps(network: Network) -> Floats:
@@ -178,8 +165,12 @@ class JunctionProblem:
         x, q = state.x_veh[self.links], state.q_veh[self.turns]
         queue = model.leaves @ q
         delay_s = model.delay_s(queue)
-        past = _Past(model, delay_s, model.history(state.past_inflow_veh[:, self.links], self.network.sample_s))
-        past = past.at_most(np.maximum(x - queue, 0.0))
+        inflow = state.past_inflow_veh[:, self.links]
+        # A miscount must not leave more on the way than there is: the first step would have no feasible flow.
+        on_the_way = _Past(inflow, delay_s, self.network.sample_s).still_veh(0.0)
+        inflow = inflow * np.minimum(1.0, np.maximum(x - queue, 0.0) / np.maximum(on_the_way, 1e-9))
+        delay_by_turn_s = delay_s[model.network.turn_link]
+        past = _Past(inflow[:, model.network.turn_link], delay_by_turn_s, self.network.sample_s)
         ends = timing.end_s[:, self.turns]
         lags = np.arange(self._lags + 1)[:, None]
         parameters: list[Any] = [
@@ -188,8 +179,8 @@ class JunctionProblem:
             state.source_queue_veh[self.links],
             np.repeat(forecast.demand_veh[: self.settings.horizon, self.links], self.substeps, 0) / self.substeps,
             state.fraction[self.turns],
-            [np.clip((delay_s[past.by_turn] - end) / step_s + 1.0 - lags, 0.0, 1.0) for end in ends],
-            [past.still_by_turn_veh(step * step_s + ends[step % self.substeps]) for step in range(self._lags)],
+            [np.clip((delay_by_turn_s - end) / step_s + 1.0 - lags, 0.0, 1.0) for end in ends],
+            [past.still_veh(step * step_s + ends[step % self.substeps]) for step in range(self._lags)],
             timing.shown[:, self.stages],
             timing.opening[:, self.turns],
         ]
