@@ -18,6 +18,8 @@ FULL_SHARE = 0.8
 """Share of its storage from which the watched stretch counts as full, and the queue as reaching beyond it."""
 QUIET_SHARE = 0.3
 """Share of its storage up to which the watched stretch leaves the vehicles before it moving freely."""
+CROWDED_SHARE, CROWDED_SD_VEH = 0.5, 8.0
+"""Share from which nothing can be said of those before it, and the standard deviation of what is said just under it."""
 BIAS_STEP_SHARE = 0.01
 """By how much of the loops' error a link's loops may come to differ in a step."""
 SEEN_SD_VEH, SEEN_SD_SHARE = 1.0, 0.1
@@ -99,8 +101,9 @@ class Estimator:
         covariance[:, 1, 1] += self._bias_step_variance
 
         hidden = (self._hidden * self._past_inflow_veh).sum(axis=0)
-        quiet = seen.seen_veh <= QUIET_SHARE * self._watched_veh
-        variance = SEEN_SD_VEH**2 + (SEEN_SD_SHARE * hidden) ** 2
+        crowd = (seen.seen_veh / self._watched_veh - QUIET_SHARE) / (CROWDED_SHARE - QUIET_SHARE)
+        quiet = crowd < 1
+        variance = SEEN_SD_VEH**2 + (SEEN_SD_SHARE * hidden) ** 2 + (CROWDED_SD_VEH * np.maximum(crowd, 0.0)) ** 2
         gain = quiet[:, None] * covariance[:, :, 0] / (covariance[:, 0, 0] + variance)[:, None]
         residual = seen.seen_veh + hidden - x
         self._covariance = covariance - gain[:, :, None] * covariance[:, None, 0, :]

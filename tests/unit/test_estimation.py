@@ -184,7 +184,8 @@ class FreeRoad:
 
     def jam(self, steps: int) -> Floats:
         """(steps, Z) errors while as many leave as enter, after a step in which nobody left."""
-        through, view = each(self.net, self.rate_veh), each(self.net, self.rate_veh)
+        # More than half of what the view holds: of those behind it nothing can be said.
+        through, view = each(self.net, self.rate_veh), each(self.net, 30.0)
         first = self._step(each(self.net, 0.0), view) - self.x_veh - self.rate_veh
         rest = [self._step(through, view) - self.x_veh - self.rate_veh for _ in range(steps - 1)]
         return np.array([first, *rest])
