@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -58,14 +59,23 @@ def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bo
         raise KeyboardInterrupt
 
 
+def _study(command: Callable[..., None]) -> Callable[..., None]:
+    """The options that studies over recorded runs have in common."""
+    for option in (
+        click.option("--step", default="10", show_default=True, help="Model step in seconds; 120 is the whole cycle."),
+        click.option("--hours", default="2", show_default=True, help="Simulated hours of each run."),
+        click.option("--controller", default="dmpc", show_default=True, help="Controller of the recorded runs."),
+        click.option("--net", default="utn17", show_default=True, help="Shipped network, or a .net.xml file."),
+    ):
+        command = option(command)
+    return command
+
+
 @cli.command()
-@click.option("--net", default="utn17", show_default=True, help="Shipped network, or a .net.xml file.")
-@click.option("--controller", default="dmpc", show_default=True, help="Controller of the recorded runs.")
+@_study
 @click.option("--demand", default="0.6,1.0,1.3", show_default=True, help="Demands, separated by commas.")
 @click.option("--seeds", default="5", show_default=True, help="How many seeds, from 1 on.")
-@click.option("--hours", default="2", show_default=True)
 @click.option("--horizon", default="7", show_default=True, help="Control steps ahead.")
-@click.option("--step", default="10", show_default=True, help="The model's step in seconds; 120 is the whole cycle.")
 @click.option("--inputs", default="known", show_default=True, help="Demand of the predictions: known or forecast.")
 @click.option("--turning", default="forecast", show_default=True, help="Turning fractions: known or forecast.")
 @click.option("--calibration", help="Calibration file, or none.  [the one beside the net]")
@@ -99,12 +109,9 @@ def mismatch(out: Path | None, with_floor: bool, as_json: bool, demand: str, **f
 
 
 @cli.command()
-@click.option("--net", default="utn17", show_default=True, help="Shipped network, or a .net.xml file.")
-@click.option("--controller", default="dmpc", show_default=True, help="Controller of the recorded runs.")
+@_study
 @click.option("--demand", default="0.7,0.9,1.1,1.25", show_default=True, help="Demands, separated by commas.")
 @click.option("--seeds", default="201,202", show_default=True, help="Seeds, separated by commas.")
-@click.option("--hours", default="2", show_default=True)
-@click.option("--step", default="10", show_default=True, help="The model's step in seconds; 120 is the whole cycle.")
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder for the runs; must be new or empty."
 )

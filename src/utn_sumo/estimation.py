@@ -13,6 +13,7 @@ import numpy as np
 
 from utn_sumo.contract import Floats, Measurement, Network, State
 from utn_sumo.detectors import AREA_REACH_M
+from utn_sumo.model import share_on_the_way
 
 FULL_SHARE = 0.8
 """Share of its storage from which the watched stretch counts as full, and the queue as reaching beyond it."""
@@ -62,8 +63,8 @@ class Estimator:
         length_m = np.array([link.length_m for link in network.links])
         speed_m_s = np.array([link.free_speed_m_s for link in known.links])
         self._watched_veh = network.storage_veh * np.minimum(1, AREA_REACH_M / length_m)
-        hidden_samples = np.maximum(length_m - AREA_REACH_M, 0) / speed_m_s / network.sample_s
-        self._hidden = np.clip(hidden_samples - np.arange(known.delay_samples)[:, None], 0.0, 1.0)
+        hidden_s = np.maximum(length_m - AREA_REACH_M, 0) / speed_m_s
+        self._hidden = share_on_the_way(hidden_s, network.sample_s, known.delay_samples)
         """(H, Z) share of each past sample's inflow that has not come into view, on a free road."""
         same_link = network.turn_link[:, None] == network.turn_link
         same_green = (network.serves[:, :, None] == network.serves[:, None, :]).all(axis=0)

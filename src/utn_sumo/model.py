@@ -268,6 +268,14 @@ class LinkModel:
         return after, StepFlows(leaving, inflow, arriving)
 
 
+def share_on_the_way(since_s: Floats, interval_s: float, intervals: int) -> Floats:
+    """(intervals, n) share of each past interval, newest first, that entered less than `since_s` (n,) ago.
+
+    The inflow is even within an interval: `LinkModel.on_the_way` for numbers, all intervals at once.
+    """
+    return np.clip(since_s / interval_s - np.arange(intervals)[:, None], 0.0, 1.0)
+
+
 @dataclass(frozen=True)
 class GreenWindows:
     """Where the green stands in the model steps of a control step."""

@@ -31,8 +31,9 @@ class DistributedMPC:
         self.settings = Settings(**settings)
         self.horizon = self.settings.horizon
         self.network = network
-        self._model = LinkModel(network, self.settings.step_s or network.control_step_s)
-        check_step(network, self._model.step_s)
+        step_s = self.settings.step_s or network.control_step_s
+        check_step(network, step_s)
+        self._model = LinkModel(network, step_s)
         self._expected_s = network.equal_split().green_s
         """(S,) greens that the coming step is likely to have: where they stand is frozen in the problem."""
         fed = [link for link, item in enumerate(network.links) if not item.is_source]

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from utn_controllers.distributed_mpc.settings import Settings
 from utn_sumo.contract import Floats, Forecast, Network, State
-from utn_sumo.model import CasadiOperations, LinkModel, green_windows
+from utn_sumo.model import CasadiOperations, LinkModel, green_windows, share_on_the_way
 
 REGULARISATION = 1e-3
 """Weight of the squared flows: makes the Hessian definite and the plan unique; 1e-3 veh a step at 1 veh."""
@@ -95,9 +95,8 @@ class _Past:
     sample_s: float
 
     def still_veh(self, at_s: Any) -> Floats:
-        """(n,) vehicles still on the way `at_s` from now: SPEC 2.5 as in `LinkModel.on_the_way`."""
-        lags = np.arange(len(self.inflow_veh))[:, None]
-        share = np.clip((self.delay_s - at_s) / self.sample_s - lags, 0.0, 1.0)
+        """(n,) vehicles still on the way `at_s` from now."""
+        share = share_on_the_way(self.delay_s - at_s, self.sample_s, len(self.inflow_veh))
         return np.asarray((share * self.inflow_veh).sum(axis=0))
 
 
@@ -172,14 +171,13 @@ class JunctionProblem:
         delay_by_turn_s = delay_s[model.network.turn_link]
         past = _Past(inflow[:, model.network.turn_link], delay_by_turn_s, self.network.sample_s)
         ends = timing.end_s[:, self.turns]
-        lags = np.arange(self._lags + 1)[:, None]
         parameters: list[Any] = [
             x,
             q,
             state.source_queue_veh[self.links],
             np.repeat(forecast.demand_veh[: self.settings.horizon, self.links], self.substeps, 0) / self.substeps,
             state.fraction[self.turns],
-            [np.clip((delay_by_turn_s - end) / step_s + 1.0 - lags, 0.0, 1.0) for end in ends],
+            [share_on_the_way(delay_by_turn_s - end + step_s, step_s, self._lags + 1) for end in ends],
             [past.still_veh(step * step_s + ends[step % self.substeps]) for step in range(self._lags)],
             timing.shown[:, self.stages],
             timing.opening[:, self.turns],
