@@ -28,8 +28,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from utn_controllers.distributed_mpc import DistributedMPC
-from utn_controllers.distributed_mpc.whole import optimum
+from utn_controllers.mpc.distributed import DistributedMPC
+from utn_controllers.mpc.whole import optimum
 from utn_sumo import bridge, calibration, mismatch, network, recording, replay, sumo_tools
 from utn_sumo.contract import Forecast, Measurement, Network, State
 from utn_sumo.detectors import Miscount

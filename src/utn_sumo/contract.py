@@ -107,6 +107,8 @@ class Network:
     edge_length_m: Mapping[str, float]
     startup_lag_s: float
     """Time from the start of green until the queue moves over the stop line; the yellow gives it back at its end."""
+    whole_step_s: float | None = None
+    """Of a part: the control step of the network that it is a part of, which its own cycles need not tell."""
 
     @cached_property
     def turn_link(self) -> Ints:
@@ -130,6 +132,25 @@ class Network:
         for index, stage in enumerate(self.stages):
             matrix[index, list(stage.turns)] = True
         return matrix
+
+    @cached_property
+    def turn_stages(self) -> tuple[Ints, Ints, Ints]:
+        """Stages of each turn in turn, one after the other; where each turn's begin; the turns that have any."""
+        turn, stage = np.array(
+            sorted((turn, index) for index, item in enumerate(self.stages) for turn in item.turns), dtype=np.int64
+        ).T
+        turns, starts = np.unique(turn, return_index=True)
+        return stage, starts, turns
+
+    @cached_property
+    def links_of(self) -> tuple[Ints, ...]:
+        """(J,) links that enter each junction."""
+        return _places(self.link_junction, len(self.junctions))
+
+    @cached_property
+    def turns_of(self) -> tuple[Ints, ...]:
+        """(J,) turns of each junction's links."""
+        return _places(self.link_junction[self.turn_link], len(self.junctions))
 
     @cached_property
     def link_junction(self) -> Ints:
@@ -167,6 +188,37 @@ class Network:
         return np.array([link.queue_spacing_m / link.free_speed_m_s for link in self.links])
 
     @cached_property
+    def clearance_s(self) -> Floats:
+        """(S,) clearance after each stage."""
+        return np.array([stage.clearance_s for stage in self.stages])
+
+    @cached_property
+    def cycle_starts_s(self) -> Floats:
+        """(R, S) starts of the cycles of each stage's junction in a control step, the one under way at 0 first."""
+        cycle_s, offset_s = (
+            np.array([getattr(junction, name) for junction in self.junctions])[self.stage_junction]
+            for name in ("cycle_s", "offset_s")
+        )
+        repeats = np.arange(-1, int(np.ceil(self.control_step_s / cycle_s.min())))
+        return np.asarray(offset_s % cycle_s + repeats[:, None] * cycle_s)
+
+    def since_cycle_start_s(self, green_s: Floats) -> Floats:
+        """(..., S) from the start of its junction's cycle to each stage's green, under the plan `green_s` (..., S)."""
+        order, head = self._stage_order
+        lasts = (green_s + self.clearance_s)[..., order]
+        begins = np.cumsum(lasts, axis=-1) - lasts
+        since = np.empty_like(lasts)
+        since[..., order] = begins - begins[..., head]
+        return since
+
+    @cached_property
+    def _stage_order(self) -> tuple[Ints, Ints]:
+        """Stages in the order of their junctions' cycles; for each, where its junction's first one is in that order."""
+        counts = [len(junction.stages) for junction in self.junctions]
+        order = np.concatenate([junction.stages for junction in self.junctions]).astype(np.int64)
+        return order, np.repeat(np.cumsum([0, *counts[:-1]]), counts)
+
+    @cached_property
     def min_green_s(self) -> Floats:
         """(S,) shortest green of each stage."""
         return np.array([self.junctions[stage.junction].min_green_s for stage in self.stages])
@@ -191,7 +243,7 @@ class Network:
     @property
     def control_step_s(self) -> float:
         """Time between two decisions: the least common multiple of the cycles (SPEC 2.7, N = 1)."""
-        return float(np.lcm.reduce(self.cycle_s.astype(np.int64)))
+        return self.whole_step_s or float(np.lcm.reduce(self.cycle_s.astype(np.int64)))
 
     @property
     def samples(self) -> int:
@@ -208,8 +260,7 @@ class Network:
 
         Indices count within the part; a turn that leads to another junction ends in EXIT.
         """
-        links = [index for index, link in enumerate(self.links) if link.junction == junction]
-        turns = [index for index, turn in enumerate(self.turns) if turn.link in links]
+        links, turns = self.links_of[junction].tolist(), self.turns_of[junction].tolist()
         place = {link: position for position, link in enumerate(links)}
         turn_place = {turn: position for position, turn in enumerate(turns)}
         whole = self.junctions[junction]
@@ -243,6 +294,7 @@ class Network:
             edge_lanes=self.edge_lanes,
             edge_length_m=self.edge_length_m,
             startup_lag_s=self.startup_lag_s,
+            whole_step_s=self.control_step_s,
         )
 
     def link_index(self, link_id: str) -> int:
@@ -257,6 +309,12 @@ class Network:
             for position, stage in enumerate(junction.stages):
                 green[stage] = share + (position < rest)
         return Plan(green_s=green)
+
+
+def _places(owner: Ints, owners: int) -> tuple[Ints, ...]:
+    """For each owner the places at which `owner` names it, in order."""
+    order = np.argsort(owner, kind="stable")
+    return tuple(np.split(order, np.searchsorted(owner[order], np.arange(1, owners))))
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,19 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import scipy.sparse as sp
 
 from utn_sumo.contract import EXIT, SAMPLE_S, Floats, Network
 from utn_sumo.errors import SettingError
+
+Sparse = Any
+"""A scipy.sparse CSR matrix: a network's incidences are many zeros."""
 
 
 class Operations(Protocol):
     """The few operations that the model needs besides + - * /."""
 
-    def matmul(self, matrix: Floats, vector: Any) -> Any: ...
+    def matmul(self, matrix: Sparse, vector: Any) -> Any: ...
     def minimum(self, a: Any, b: Any) -> Any: ...
     def maximum(self, a: Any, b: Any) -> Any: ...
     def settled(self, a: Any, b: Any) -> bool:
@@ -37,8 +41,9 @@ SETTLED_VEH = 1e-12
 class NumpyOperations:
     """Numbers. The last axis is that of links, turns or stages; any axes before it are a batch of cases."""
 
-    def matmul(self, matrix: Floats, vector: Any) -> Any:
-        return vector @ matrix.T
+    def matmul(self, matrix: Sparse, vector: Any) -> Any:
+        batch = np.shape(vector)[:-1]
+        return (matrix @ vector.reshape(-1, matrix.shape[1]).T).T.reshape(*batch, -1) if batch else matrix @ vector
 
     def minimum(self, a: Any, b: Any) -> Any:
         return np.minimum(a, b)
@@ -58,8 +63,8 @@ class CasadiOperations:
 
         self._casadi = casadi
 
-    def matmul(self, matrix: Floats, vector: Any) -> Any:
-        return self._casadi.mtimes(self._casadi.sparsify(self._casadi.DM(matrix)), vector)
+    def matmul(self, matrix: Sparse, vector: Any) -> Any:
+        return self._casadi.mtimes(self._casadi.DM(matrix.tocsc()), vector)
 
     def minimum(self, a: Any, b: Any) -> Any:
         return self._casadi.fmin(a, b)
@@ -100,8 +105,13 @@ class StepFlows:
 WAVE_SPEED_M_S = 6.0
 """Speed at which a queue's start-up travels upstream: a standing vehicle's 7.5 m in about 1.3 s."""
 STEP_TOLERANCE = 1e-9
+MOST_SWEEPS, RADIUS_POWER = 200, 64
 INFINITE_ROOM_VEH = 1e9
 """Room beyond an exit: the third term of SPEC 2.3 does not bind there."""
+
+
+def _incidence(rows: Any, columns: Any, shape: tuple[int, int]) -> Sparse:
+    return sp.csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
 
 
 class LinkModel:
@@ -113,12 +123,14 @@ class LinkModel:
         self.operations: Operations = operations or NumpyOperations()
         links, turns = len(network.links), len(network.turns)
         fed = network.turn_next != EXIT
-        self.leaves = np.zeros((links, turns))
+        self.leaves = _incidence(network.turn_link, np.arange(turns), (links, turns))
         """(Z, M) 1 where a turn leaves a link: sums by link."""
-        self.leaves[network.turn_link, np.arange(turns)] = 1
-        self.feeds = np.zeros((links, turns))
+        self.feeds = _incidence(network.turn_next[fed], np.flatnonzero(fed), (links, turns))
         """(Z, M) 1 where a turn feeds a link."""
-        self.feeds[network.turn_next[fed], np.flatnonzero(fed)] = 1
+        stages = np.repeat(np.arange(len(network.stages)), [len(stage.turns) for stage in network.stages])
+        served = np.concatenate([stage.turns for stage in network.stages]).astype(np.int64)
+        self.served = _incidence(served, stages, (turns, len(network.stages)))
+        """(M, S) 1 where a stage serves a turn."""
         self._is_exit = (~fed).astype(float)
         self._is_source = network.is_source.astype(float)
         self._saturation_veh_s = network.saturation_flow_veh_s[network.turn_link]
@@ -137,12 +149,23 @@ class LinkModel:
 
         With a delay under one step (delta = 0) an inflow passes on within the step, round a circuit too.
         One sweep hands it on by one link, and shrinks it by the turning fraction: the spectral radius of the
-        turning matrix bounds what is left (SPEC 2, known weak points).
+        turning matrix bounds what is left (SPEC 2, known weak points), and the row sums of a power
+        bound the radius.
         """
-        network = self.network
-        matrix = self.feeds @ (network.fraction[:, None] * self.leaves.T)
-        radius = max(np.abs(np.linalg.eigvals(matrix)).max(), 1e-6) if len(matrix) else 1e-6
-        return int(min(200, max(len(network.junctions), np.ceil(np.log(1e-12) / np.log(min(radius, 0.87))))))
+        matrix = self.feeds @ sp.diags_array(self.network.fraction) @ self.leaves.T
+        reach = np.ones(len(self.network.links))
+        for _ in range(RADIUS_POWER):
+            reach = matrix @ reach
+        radius = np.clip(reach.max(initial=0.0) ** (1 / RADIUS_POWER), 1e-6, 0.87)
+        return int(min(MOST_SWEEPS, max(len(self.network.junctions), np.ceil(np.log(1e-12) / np.log(radius)))))
+
+    def by_link(self, turns: Any) -> Any:
+        """(..., Z) what (..., M) turns sum up to by the link that they leave."""
+        return self.operations.matmul(self.leaves, turns)
+
+    def at_turns(self, links: Any) -> Any:
+        """(..., M) each turn's link's number of (..., Z)."""
+        return self.operations.matmul(self.leaves.T, links)
 
     def delay_s(self, queue_veh: Any) -> Any:
         """(Z,) time from entry to the tail of the queue (SPEC 2.6), never negative."""
@@ -218,8 +241,8 @@ class LinkModel:
         stand anywhere. Vehicles are conserved, and 0 <= q <= x <= storage holds afterwards if it held before.
         """
         ops = self.operations
-        to_turns, to_next = self.leaves.T, self.feeds.T
-        turn_green_s = ops.matmul(self.network.serves.T.astype(float), green_s)
+        to_next = self.feeds.T
+        turn_green_s = ops.matmul(self.served, green_s)
         saturated = self.saturated_veh(turn_green_s, fraction)
         room = ops.maximum(self.room_veh(state.x_veh), 0.0)
         opening = None if green_end_s is None else self.opening(turn_green_s, green_end_s)
@@ -229,12 +252,12 @@ class LinkModel:
         feeding = ops.matmul(self.feeds, open_fraction)
         claim = open_fraction / ops.maximum(ops.matmul(to_next, feeding) + self._is_exit, 1e-9)
 
-        queue = ops.matmul(self.leaves, state.q_veh)
+        queue = self.by_link(state.q_veh)
         moving = state.x_veh - queue
         delay = self.delay_s(queue)
         share = self.on_the_way(delay)
-        share_at_end = None if green_end_s is None else self.on_the_way(ops.matmul(to_turns, delay), green_end_s)
-        past_by_turn = [ops.matmul(to_turns, past) for past in state.past_inflow_veh]
+        share_at_end = None if green_end_s is None else self.on_the_way(self.at_turns(delay), green_end_s)
+        past_by_turn = [self.at_turns(past) for past in state.past_inflow_veh]
         wanting = (state.source_queue_veh + demand_veh) * self._is_source
 
         # With delays under one step the inflow depends on itself round a circuit, and so does the room: sweep to
@@ -243,24 +266,24 @@ class LinkModel:
         inflow = entering = ops.minimum(wanting, room)
         for _ in range(self.sweeps):
             arriving = ops.maximum(self.arriving_veh(moving, inflow, state.past_inflow_veh, share), 0.0)
-            queued = state.q_veh + fraction * ops.matmul(to_turns, arriving)
+            queued = state.q_veh + fraction * self.at_turns(arriving)
             unsaturated = queued
             if share_at_end is not None:
-                inflow_by_turn, moving_by_turn = ops.matmul(to_turns, inflow), ops.matmul(to_turns, moving)
+                inflow_by_turn, moving_by_turn = self.at_turns(inflow), self.at_turns(moving)
                 in_time = self.arriving_veh(moving_by_turn, inflow_by_turn, past_by_turn, share_at_end)
                 unsaturated = state.q_veh + fraction * ops.maximum(in_time, 0.0)
             # SPEC 2.3, the three terms.
             oversaturated = claim * ops.matmul(to_next, open_room) + INFINITE_ROOM_VEH * self._is_exit
             leaving = ops.minimum(unsaturated, ops.minimum(saturated, oversaturated))
             if opening is not None:
-                open_room = room + ops.matmul(self.leaves, opening * leaving)
+                open_room = room + self.by_link(opening * leaving)
                 entering = ops.minimum(wanting, open_room)
             last, inflow = inflow, entering + ops.matmul(self.feeds, leaving)
             if ops.settled(last, inflow):
                 break
 
         after = ModelState(
-            x_veh=state.x_veh + inflow - ops.matmul(self.leaves, leaving),
+            x_veh=state.x_veh + inflow - self.by_link(leaving),
             q_veh=queued - leaving,
             source_queue_veh=state.source_queue_veh + demand_veh * self._is_source - entering,
             past_inflow_veh=(*[inflow / self.samples] * self.samples, *state.past_inflow_veh)[: self.lags],
@@ -301,20 +324,13 @@ def green_windows(network: Network, green_s: Floats, step_s: float) -> GreenWind
     into the yellow.
     """
     steps = round(network.control_step_s / step_s)
-    begin = np.arange(steps) * step_s
-    shape = (*green_s.shape[:-1], steps, green_s.shape[-1])
-    shown, last = np.zeros(shape), np.zeros(shape)
-    for junction in network.junctions:
-        repeats = int(np.ceil(network.control_step_s / junction.cycle_s))
-        for repeat in range(-1, repeats):
-            start = np.full(green_s.shape[:-1], junction.offset_s % junction.cycle_s + repeat * junction.cycle_s)
-            for stage in junction.stages:
-                end = start + green_s[..., stage]
-                window = [np.asarray(edge + network.startup_lag_s)[..., None] for edge in (start, end)]
-                closes = np.minimum(window[1], begin + step_s) - begin
-                overlap = closes - np.maximum(window[0] - begin, 0.0)
-                shown[..., stage] += np.maximum(overlap, 0.0)
-                last[..., stage] = np.where(overlap > 0, np.maximum(last[..., stage], closes), last[..., stage])
-                start = end + network.stages[stage].clearance_s
-    by_turn = np.where(network.serves, last[..., None], 0.0).max(axis=-2)
-    return GreenWindows(shown, by_turn)
+    # All stages at once: (..., repetitions, S), then (..., steps, repetitions, S).
+    start = network.cycle_starts_s + (network.since_cycle_start_s(green_s) + network.startup_lag_s)[..., None, :]
+    begin = np.arange(steps)[:, None, None] * step_s
+    closes = np.minimum((start + green_s[..., None, :])[..., None, :, :], begin + step_s) - begin
+    overlap = np.maximum(closes - np.maximum(start[..., None, :, :] - begin, 0.0), 0.0)
+    last = np.where(overlap > 0, closes, 0.0).max(axis=-2)
+    stages, starts, turns = network.turn_stages
+    by_turn = np.zeros((*last.shape[:-1], len(network.turns)))
+    by_turn[..., turns] = np.maximum.reduceat(last[..., stages], starts, axis=-1)
+    return GreenWindows(overlap.sum(axis=-2), by_turn)

@@ -46,14 +46,14 @@ def observe(model: LinkModel, log: Log, at: Ints, source_queue_veh: Floats) -> M
     past = [model.history(counted[:, (steps - k) * samples :], network.sample_s) for k in at]
     past_inflow = tuple(np.array(lag) for lag in zip(*past, strict=True))
     x, measured = log.x_veh[at], log.q_veh[at]
-    share = model.on_the_way(model.delay_s(measured @ model.leaves.T), 0.0)[1:]
+    share = model.on_the_way(model.delay_s(model.by_link(measured)), 0.0)[1:]
     moving = np.sum([part * inflow for part, inflow in zip(share, past_inflow, strict=True)], axis=0)
     queue = np.clip(x - moving, 0.0, x)
     # Who is queued beyond the measure has a turn that nobody knows yet.
-    more = np.maximum(queue - measured @ model.leaves.T, 0.0)
-    split = measured + log.fraction[at] * (more @ model.leaves) + 1e-9
-    split = split / (split @ model.leaves.T @ model.leaves)
-    return ModelState(x, split * (queue @ model.leaves), source_queue_veh[at], past_inflow)
+    more = np.maximum(queue - model.by_link(measured), 0.0)
+    split = measured + log.fraction[at] * model.at_turns(more) + 1e-9
+    split = split / model.at_turns(model.by_link(split))
+    return ModelState(x, split * model.at_turns(queue), source_queue_veh[at], past_inflow)
 
 
 def predict(
@@ -77,7 +77,7 @@ def predict(
             state, flows = model.step(state, shown, demand_veh[at + ahead] / steps, fraction[ahead], end)
             entered = entered + flows.inflow_veh
         x.append(state.x_veh)
-        queue.append(state.q_veh @ model.leaves.T)
+        queue.append(model.by_link(state.q_veh))
         inflow.append(entered)
     return Prediction(np.array(x), np.array(queue), np.array(inflow))
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from utn_controllers.distributed_mpc import DistributedMPC
 from utn_controllers.fixed_time import FixedTime
+from utn_controllers.mpc.distributed import DistributedMPC
 from utn_sumo import controllers
 from utn_sumo.contract import Network
 from utn_sumo.errors import ControllerError, SettingError, UtnError

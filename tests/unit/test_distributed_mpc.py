@@ -13,16 +13,16 @@ from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
 
-from utn_controllers.distributed_mpc import DistributedMPC, Settings
-from utn_controllers.distributed_mpc.coordination import Consensus
-from utn_controllers.distributed_mpc.problem import (
+from utn_controllers.mpc.coordination import Consensus
+from utn_controllers.mpc.distributed import DistributedMPC, Settings
+from utn_controllers.mpc.problem import (
     REGULARISATION,
     JunctionProblem,
     QuadraticProgram,
     Timing,
     remaining_steps,
 )
-from utn_controllers.distributed_mpc.whole import optimum
+from utn_controllers.mpc.whole import optimum
 from utn_sumo import signals
 from utn_sumo.contract import EXIT, Floats, Forecast, Network, Plan, State
 from utn_sumo.errors import ControllerError, SettingError

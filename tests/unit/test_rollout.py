@@ -48,7 +48,7 @@ def simulated(network: Network, seed: int) -> Log:
         "entered_by_sample_veh": entered,
         "turned_veh": turned,
         "true_x_veh": [s.x_veh for s in after],
-        "true_queue_veh": [s.q_veh @ model.leaves.T for s in after],
+        "true_queue_veh": [model.by_link(s.q_veh) for s in after],
         "true_waiting_veh": [s.source_queue_veh for s in after],
     }
     return Log(**{name: np.array(rows)[:, None] for name, rows in one.items()})
@@ -90,7 +90,7 @@ def test_observed_states_hold_the_counted_vehicles_and_no_more_queue_than_vehicl
     at = starts(log, 1)
     state = observe(model, log, at, log.source_queue_veh)
     assert np.asarray(state.x_veh) == pytest.approx(log.x_veh[at])
-    assert (state.q_veh @ model.leaves.T <= log.x_veh[at] + 1e-9).all()
+    assert (model.by_link(state.q_veh) <= log.x_veh[at] + 1e-9).all()
     assert np.min(state.q_veh) >= 0
     # The past is what was counted, newest first: three samples back from the start of the fourth step.
     assert state.past_inflow_veh[2][2] == pytest.approx(log.entered_by_sample_veh[2, :, -3])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from utn_controllers.distributed_mpc.problem import JunctionProblem, QuadraticProgram, Timing
+from utn_controllers.mpc.problem import JunctionProblem, QuadraticProgram, Timing
 from utn_sumo.contract import Floats, Forecast, State
 from utn_sumo.errors import ControllerError
 

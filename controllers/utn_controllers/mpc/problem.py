@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from utn_controllers.distributed_mpc.settings import Settings
+from utn_controllers.mpc.settings import ProblemSettings
 from utn_sumo.contract import Floats, Forecast, Network, State
 from utn_sumo.model import CasadiOperations, LinkModel, green_windows, share_on_the_way
 
@@ -50,7 +50,7 @@ class Layout:
     size: int
 
     @classmethod
-    def of(cls, part: Network, settings: Settings, steps: int) -> Layout:
+    def of(cls, part: Network, settings: ProblemSettings, steps: int) -> Layout:
         """The layout for one junction's part of a network, over so many model steps."""
         links = len(part.links)
         start = 0
@@ -115,7 +115,7 @@ def remaining_steps(network: Network) -> Floats:
 class JunctionProblem:
     """The problem of one junction: numbers in (state, forecast), quadratic programme out."""
 
-    def __init__(self, network: Network, junction: int, settings: Settings):
+    def __init__(self, network: Network, junction: int, settings: ProblemSettings):
         self.network = network
         self.junction = junction
         self.settings = settings
@@ -271,7 +271,7 @@ class JunctionProblem:
 
         settings, part, model, layout = self.settings, self.part, self.model, self.layout
         by_link = model.operations.matmul
-        serves, source = part.serves.T.astype(float), part.is_source.astype(float)
+        source = part.is_source.astype(float)
         budget_s, lags = float(part.green_budget_s[0]), self._lags + 1
         cost: Any = 0
         rows = [(ca.sum1(z[green]), budget_s, budget_s) for green in layout.green]
@@ -288,7 +288,7 @@ class JunctionProblem:
                 in_time = in_time - still_in_green[step]
             for lag, entered in enumerate(inflows):
                 in_time = in_time - share_in_green[substep * lags + lag] * by_link(model.leaves.T, entered)
-            saturated = model.saturated_veh(by_link(serves, green * shown[substep]), fraction)
+            saturated = model.saturated_veh(by_link(model.served, green * shown[substep]), fraction)
             room = model.room_veh(x) + by_link(model.leaves, opening[substep] * leaving)
             # The three terms of SPEC 2.3, the third as the consumer's: it knows its storage.
             rows += [
@@ -300,7 +300,7 @@ class JunctionProblem:
             x = x + inflow - by_link(model.leaves, leaving)
             waiting = waiting + source * (demand[step] - inflow)
             rows += [(waiting[int(link)], 0.0, np.inf) for link in np.flatnonzero(part.is_source)]
-            part_of_step = settings.stage_cost(x, waiting, part) + STORAGE_PENALTY * ca.sum1(over)
+            part_of_step = settings.stage_cost(x, waiting, part.storage_veh) + STORAGE_PENALTY * ca.sum1(over)
             cost += part_of_step / self.substeps
             cost += REGULARISATION / 2 * (ca.sumsqr(leaving) + ca.sumsqr(inflow) + ca.sumsqr(over))
         cost += sum(settings.green_cost(z[green]) for green in layout.green)

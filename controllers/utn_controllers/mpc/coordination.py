@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from utn_controllers.distributed_mpc.settings import Settings
+from utn_controllers.mpc.settings import Settings
 from utn_sumo.contract import Floats
 
 if TYPE_CHECKING:
-    from utn_controllers.distributed_mpc.agent import Agent
+    from utn_controllers.mpc.agent import Agent
 
 ADAPT_RATIO = 10.0
 """The penalty adapts while one residual is this many times the other, then it is frozen for good."""

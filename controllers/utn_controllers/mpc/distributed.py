@@ -1,10 +1,4 @@
-"""Distributed MPC: one agent a junction, coordinated with its neighbours (SPEC 4).
-
-settings      what a user may set
-problem       one junction's problem, stated in CasADi
-agent         its solver, and the copies that it shares
-coordination  ADMM among the agents
-"""
+"""The controller `dmpc`: one agent a junction, coordinated with its neighbours (SPEC 4)."""
 
 from __future__ import annotations
 
@@ -12,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from utn_controllers.distributed_mpc.agent import Agent
-from utn_controllers.distributed_mpc.coordination import Consensus, admm
-from utn_controllers.distributed_mpc.problem import JunctionProblem, Timing
-from utn_controllers.distributed_mpc.settings import Settings
+from utn_controllers.mpc.agent import Agent
+from utn_controllers.mpc.coordination import Consensus, admm
+from utn_controllers.mpc.problem import JunctionProblem, Timing
+from utn_controllers.mpc.settings import Settings
 from utn_sumo.contract import Forecast, Network, Plan, State
 from utn_sumo.model import LinkModel, check_step
 

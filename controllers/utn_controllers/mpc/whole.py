@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from utn_controllers.distributed_mpc.problem import JunctionProblem, Timing
+from utn_controllers.mpc.problem import JunctionProblem, Timing
 from utn_sumo.contract import Floats, Forecast, State
 from utn_sumo.errors import ControllerError
 

@@ -1,4 +1,4 @@
-"""Settings of the distributed MPC, with the paper's values as defaults where the paper has them."""
+"""Settings of the MPC, with the paper's values as defaults where the paper has them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from utn_sumo.contract import Network
 
-
-class Settings(BaseModel):
-    """What a user may set; every field is checked when the controller is built."""
+class ProblemSettings(BaseModel):
+    """What states the problem, whoever solves it; every field is checked when the controller is built."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -29,14 +27,6 @@ class Settings(BaseModel):
     """Weight of x^2 / storage beside the time spent in the `tts` cost: what keeps room on the links."""
     terminal: float = Field(1.0, ge=0)
     """Weight of the time that the vehicles left at the horizon's end still need, in the `tts` cost."""
-    iterations: int = Field(20, ge=1, le=1000)
-    """Most ADMM iterations in a control step."""
-    rho: float = Field(0.2, gt=0)
-    """First ADMM penalty."""
-    relaxation: float = Field(1.6, gt=0, lt=2)
-    tolerance_abs: float = Field(1e-2, gt=0)
-    """Absolute tolerance of the residuals [veh]."""
-    tolerance_rel: float = Field(1e-3, ge=0)
 
     @model_validator(mode="before")
     @classmethod
@@ -52,13 +42,13 @@ class Settings(BaseModel):
             raise ValueError(message)
         return self
 
-    def stage_cost(self, x: Any, waiting: Any, part: Network) -> Any:
-        """Cost of one predicted step, in CasADi symbols: x and the source queues of a junction's links."""
+    def stage_cost(self, x: Any, waiting: Any, storage_veh: Any) -> Any:
+        """Cost of one predicted control step with `x` and the source queues `waiting` (Z,), symbols or numbers."""
         import casadi as ca  # noqa: PLC0415 - heavy
 
         if self.cost == "paper":
             return self.q * (ca.sumsqr(x) + ca.sumsqr(waiting))
-        return ca.sum1(x) + ca.sum1(waiting) + self.crowding * ca.sum1(x**2 / part.storage_veh)
+        return ca.sum1(x) + ca.sum1(waiting) + self.crowding * ca.sum1(x**2 / storage_veh)
 
     def terminal_cost(self, x: Any, waiting: Any, remaining: Any) -> Any:
         """Cost of what is left at the end of the horizon; `remaining` (Z,) steps still to travel from each link."""
@@ -75,3 +65,16 @@ class Settings(BaseModel):
         if self.cost == "paper":
             return self.r * ca.sumsqr(green)
         return 1e-4 * ca.sumsqr(green)
+
+
+class Settings(ProblemSettings):
+    """Settings of the distributed MPC: the problem's, and how the agents come to terms."""
+
+    iterations: int = Field(20, ge=1, le=1000)
+    """Most ADMM iterations in a control step."""
+    rho: float = Field(0.2, gt=0)
+    """First ADMM penalty."""
+    relaxation: float = Field(1.6, gt=0, lt=2)
+    tolerance_abs: float = Field(1e-2, gt=0)
+    """Absolute tolerance of the residuals [veh]."""
+    tolerance_rel: float = Field(1e-3, ge=0)
