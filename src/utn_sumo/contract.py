@@ -356,6 +356,19 @@ class State:
     fraction: Floats
     """(M,) turning fractions as they are at present; they sum to 1 over a link."""
 
+    def part(self, links: Ints, turns: Ints) -> State:
+        """What of it concerns these links and turns."""
+        return State(
+            self.cycle,
+            self.time_s,
+            self.x_veh[links],
+            self.q_veh[turns],
+            self.source_queue_veh[links],
+            self.past_inflow_veh[:, links],
+            self.turned_veh[turns],
+            self.fraction[turns],
+        )
+
 
 @dataclass(frozen=True)
 class Forecast:
@@ -363,6 +376,10 @@ class Forecast:
 
     demand_veh: Floats
     """(Kp, Z) vehicles that will want to enter each source link in each step ahead."""
+
+    def part(self, links: Ints) -> Forecast:
+        """What of it concerns these links."""
+        return Forecast(self.demand_veh[:, links])
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,9 @@ class Operations(Protocol):
     def matmul(self, matrix: Sparse, vector: Any) -> Any: ...
     def minimum(self, a: Any, b: Any) -> Any: ...
     def maximum(self, a: Any, b: Any) -> Any: ...
+    def share(self, a: Any) -> Any:
+        """`a`, but no less than 0 and no more than 1."""
+
     def settled(self, a: Any, b: Any) -> bool:
         """Whether a sweep changed nothing any more, where that can be known."""
 
@@ -50,6 +53,9 @@ class NumpyOperations:
 
     def maximum(self, a: Any, b: Any) -> Any:
         return np.maximum(a, b)
+
+    def share(self, a: Any) -> Any:
+        return np.minimum(np.maximum(a, 0.0), 1.0)
 
     def settled(self, a: Any, b: Any) -> bool:
         return bool(np.max(np.abs(a - b), initial=0.0) < SETTLED_VEH)
@@ -72,8 +78,35 @@ class CasadiOperations:
     def maximum(self, a: Any, b: Any) -> Any:
         return self._casadi.fmax(a, b)
 
+    def share(self, a: Any) -> Any:
+        return self._casadi.fmin(self._casadi.fmax(a, 0.0), 1.0)
+
     def settled(self, a: Any, b: Any) -> bool:  # noqa: ARG002 - symbols never know
         return False
+
+
+class SmoothOperations(CasadiOperations):
+    """CasADi symbols with a minimum and a maximum that Newton's method can follow: the kink is rounded.
+
+    Away from the kink they are off by `epsilon`^2 / (4 |a - b|), at it by `epsilon` / 2, in the unit of what is compared.
+    """
+
+    def __init__(self, epsilon: Any, share_epsilon: Any) -> None:
+        """The epsilons, of vehicles and of shares, are numbers or symbols."""
+        super().__init__()
+        self._epsilon, self._share_epsilon = epsilon, share_epsilon
+
+    def minimum(self, a: Any, b: Any) -> Any:
+        return (a + b - self._apart(a - b, self._epsilon)) / 2
+
+    def maximum(self, a: Any, b: Any) -> Any:
+        return (a + b + self._apart(a - b, self._epsilon)) / 2
+
+    def share(self, a: Any) -> Any:
+        return (self._apart(a, self._share_epsilon) - self._apart(a - 1.0, self._share_epsilon) + 1.0) / 2
+
+    def _apart(self, difference: Any, epsilon: Any) -> Any:
+        return self._casadi.sqrt(difference**2 + epsilon**2)
 
 
 @dataclass(frozen=True)
@@ -91,6 +124,34 @@ class ModelState:
 
 
 @dataclass(frozen=True)
+class StepTerms:
+    """What decides a step's flows beside the flows themselves; arrays, lists over past samples, or None without ends."""
+
+    q_veh: Any
+    """(M,) queued at the start."""
+    fraction: Any
+    """(M,)"""
+    wanting_veh: Any
+    """(Z,) that want to enter from outside."""
+    moving_veh: Any
+    """(Z,) on the link at the start and not queued."""
+    past_veh: Sequence[Any]
+    """(Z,) inflow of each past sample."""
+    on_the_way: Sequence[Any]
+    """(Z,) of the step's own and of each past inflow the share that has not arrived at the end."""
+    in_green: tuple[Any, Sequence[Any], Sequence[Any]] | None
+    """The last three by turn, and counted at the end of each turn's green; None if that is the step's end."""
+    saturated_veh: Any
+    """(M,) the second term of SPEC 2.3."""
+    room_veh: Any
+    """(Z,) at the start."""
+    claim: Any
+    """(M,) share of the room on the link that a turn feeds; 0 at an exit."""
+    opening: Any | None
+    """(M,) share of what leaves whose room reaches the link's entry within the step, if any does."""
+
+
+@dataclass(frozen=True)
 class StepFlows:
     """What moved in one step."""
 
@@ -100,6 +161,24 @@ class StepFlows:
     """(Z,) into each link, from other links and from outside."""
     arriving_veh: Any
     """(Z,) at the tail of the queue."""
+    entering_veh: Any
+    """(Z,) of the inflow, from outside."""
+    queued_veh: Any
+    """(M,) queued at the start or arrived since, before anybody leaves."""
+    open_room_veh: Any
+    """(Z,) room for the inflow: at the start and as it opens within the step."""
+
+
+@dataclass(frozen=True)
+class LinkNumbers:
+    """What the terms of SPEC 2.3 need to know of each link; CasADi symbols where many junctions share one problem."""
+
+    saturation_veh_s: Any
+    """(M,) saturation flow of each turn's link."""
+    storage_veh: Any
+    """(Z,)"""
+    room_share: Any
+    """(Z,) share of the room on a link that its entry can use within a step."""
 
 
 WAVE_SPEED_M_S = 6.0
@@ -117,7 +196,14 @@ def _incidence(rows: Any, columns: Any, shape: tuple[int, int]) -> Sparse:
 class LinkModel:
     """SPEC 2 on the links of one network, with a step of `step_s` seconds."""
 
-    def __init__(self, network: Network, step_s: float, operations: Operations | None = None):
+    def __init__(
+        self,
+        network: Network,
+        step_s: float,
+        operations: Operations | None = None,
+        numbers: LinkNumbers | None = None,
+    ):
+        """`numbers` stand in for the network's own."""
         self.network = network
         self.step_s = step_s
         self.operations: Operations = operations or NumpyOperations()
@@ -133,10 +219,13 @@ class LinkModel:
         """(M, S) 1 where a stage serves a turn."""
         self._is_exit = (~fed).astype(float)
         self._is_source = network.is_source.astype(float)
-        self._saturation_veh_s = network.saturation_flow_veh_s[network.turn_link]
         # Room that opens at the stop line reaches the entry as a wave: within one step, only so much of it does.
         self._wave_s = np.array([link.length_m for link in network.links]) / WAVE_SPEED_M_S
-        self._room_share = np.minimum(1.0, step_s / self._wave_s)
+        self.numbers = numbers or LinkNumbers(
+            network.saturation_flow_veh_s[network.turn_link],
+            network.storage_veh,
+            np.minimum(1.0, step_s / self._wave_s),
+        )
         self.samples = int(np.ceil(step_s / SAMPLE_S))
         """Samples of a step, in which the past is remembered: a long step looks back as sharply as the loops count."""
         self.sample_s = step_s / self.samples
@@ -182,11 +271,8 @@ class LinkModel:
         # Who entered less than this long before the step's start is still on the way.
         since = delay_s - (self.step_s if at_s is None else at_s)
 
-        def within(share: Any) -> Any:
-            return ops.minimum(ops.maximum(share, 0.0), 1.0)
-
-        past = [within(since / self.sample_s - lag) for lag in range(self.lags)]
-        return [within(since / self.step_s + 1.0), *past]
+        past = [ops.share(since / self.sample_s - lag) for lag in range(self.lags)]
+        return [ops.share(since / self.step_s + 1.0), *past]
 
     def history(self, counted_veh: Floats, sample_s: float) -> tuple[Floats, ...]:
         """Past inflows as the model remembers them, from counts (..., H, Z) in samples of `sample_s`, newest first."""
@@ -214,11 +300,11 @@ class LinkModel:
 
     def saturated_veh(self, green_s: Any, fraction: Any) -> Any:
         """(M,) what green lets through: the second term of SPEC 2.3. `green_s` is by turn."""
-        return fraction * self._saturation_veh_s * green_s
+        return fraction * self.numbers.saturation_veh_s * green_s
 
     def room_veh(self, x_veh: Any) -> Any:
         """(Z,) vehicles that a link takes in a step: C - x, the third term of SPEC 2.3 before it is shared out."""
-        return (self.network.storage_veh - x_veh) * self._room_share
+        return (self.numbers.storage_veh - x_veh) * self.numbers.room_share
 
     def opening(self, green_s: Any, green_end_s: Any) -> Any:
         """(M,) share of what leaves in a step whose room reaches the link's entry within the same step.
@@ -228,7 +314,7 @@ class LinkModel:
         """
         ops = self.operations
         left_s = self.step_s - self._wave_s[self.network.turn_link] - (green_end_s - green_s)
-        return ops.minimum(ops.maximum(left_s, 0.0) / ops.maximum(green_s, 1e-9), 1.0)
+        return ops.share(left_s / ops.maximum(green_s, 1e-9))
 
     def step(
         self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any, green_end_s: Any | None = None
@@ -240,55 +326,84 @@ class LinkModel:
         step's start: who reaches the queue after it waits for the next step. Without it the green may
         stand anywhere. Vehicles are conserved, and 0 <= q <= x <= storage holds afterwards if it held before.
         """
+        terms = self.terms(state, green_s, demand_veh, fraction, green_end_s)
+        # With delays under one step the inflow depends on itself round a circuit, and so does the room: sweep to
+        # the fixed point that is reached from below.
+        inflow, room = self.operations.minimum(terms.wanting_veh, terms.room_veh), terms.room_veh
+        for _ in range(self.sweeps):
+            flows = self.flows(terms, inflow, room)
+            last, inflow, room = inflow, flows.inflow_veh, flows.open_room_veh
+            if self.operations.settled(last, inflow):
+                break
+        return self.after(state, demand_veh, flows), flows
+
+    def terms(
+        self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any, green_end_s: Any | None = None
+    ) -> StepTerms:
+        """What decides the flows of the step that `step` describes, all but the flows themselves."""
         ops = self.operations
-        to_next = self.feeds.T
         turn_green_s = ops.matmul(self.served, green_s)
-        saturated = self.saturated_veh(turn_green_s, fraction)
-        room = ops.maximum(self.room_veh(state.x_veh), 0.0)
-        opening = None if green_end_s is None else self.opening(turn_green_s, green_end_s)
         # Each turn's share of the room on the link that it feeds, among the turns that have green in this step;
         # exits have all the room in the world.
-        open_fraction = fraction * ops.minimum(turn_green_s, 1.0)
+        open_fraction = fraction * ops.share(turn_green_s)
         feeding = ops.matmul(self.feeds, open_fraction)
-        claim = open_fraction / ops.maximum(ops.matmul(to_next, feeding) + self._is_exit, 1e-9)
+        claim = open_fraction / ops.maximum(ops.matmul(self.feeds.T, feeding) + self._is_exit, 1e-9)
 
         queue = self.by_link(state.q_veh)
         moving = state.x_veh - queue
         delay = self.delay_s(queue)
-        share = self.on_the_way(delay)
-        share_at_end = None if green_end_s is None else self.on_the_way(self.at_turns(delay), green_end_s)
-        past_by_turn = [self.at_turns(past) for past in state.past_inflow_veh]
-        wanting = (state.source_queue_veh + demand_veh) * self._is_source
+        in_green, opening = None, None
+        if green_end_s is not None:
+            past_by_turn = [self.at_turns(past) for past in state.past_inflow_veh]
+            in_green = self.at_turns(moving), past_by_turn, self.on_the_way(self.at_turns(delay), green_end_s)
+            opening = self.opening(turn_green_s, green_end_s)
+        return StepTerms(
+            q_veh=state.q_veh,
+            fraction=fraction,
+            wanting_veh=(state.source_queue_veh + demand_veh) * self._is_source,
+            moving_veh=moving,
+            past_veh=state.past_inflow_veh,
+            on_the_way=self.on_the_way(delay),
+            in_green=in_green,
+            saturated_veh=self.saturated_veh(turn_green_s, fraction),
+            room_veh=ops.maximum(self.room_veh(state.x_veh), 0.0),
+            claim=claim,
+            opening=opening,
+        )
 
-        # With delays under one step the inflow depends on itself round a circuit, and so does the room: sweep to
-        # the fixed point that is reached from below.
-        open_room = room
-        inflow = entering = ops.minimum(wanting, room)
-        for _ in range(self.sweeps):
-            arriving = ops.maximum(self.arriving_veh(moving, inflow, state.past_inflow_veh, share), 0.0)
-            queued = state.q_veh + fraction * self.at_turns(arriving)
-            unsaturated = queued
-            if share_at_end is not None:
-                inflow_by_turn, moving_by_turn = self.at_turns(inflow), self.at_turns(moving)
-                in_time = self.arriving_veh(moving_by_turn, inflow_by_turn, past_by_turn, share_at_end)
-                unsaturated = state.q_veh + fraction * ops.maximum(in_time, 0.0)
-            # SPEC 2.3, the three terms.
-            oversaturated = claim * ops.matmul(to_next, open_room) + INFINITE_ROOM_VEH * self._is_exit
-            leaving = ops.minimum(unsaturated, ops.minimum(saturated, oversaturated))
-            if opening is not None:
-                open_room = room + self.by_link(opening * leaving)
-                entering = ops.minimum(wanting, open_room)
-            last, inflow = inflow, entering + ops.matmul(self.feeds, leaving)
-            if ops.settled(last, inflow):
-                break
+    def flows(self, terms: StepTerms, inflow_veh: Any, open_room_veh: Any) -> StepFlows:
+        """The flows that follow from the terms of a step and a guess of its inflow (Z,) and its room (Z,).
 
-        after = ModelState(
-            x_veh=state.x_veh + inflow - self.by_link(leaving),
-            q_veh=queued - leaving,
-            source_queue_veh=state.source_queue_veh + demand_veh * self._is_source - entering,
+        The guess is right where the flows have the same inflow and room: that is the exact model.
+        """
+        ops = self.operations
+        arriving = ops.maximum(self.arriving_veh(terms.moving_veh, inflow_veh, terms.past_veh, terms.on_the_way), 0.0)
+        queued = terms.q_veh + terms.fraction * self.at_turns(arriving)
+        unsaturated = queued
+        if terms.in_green is not None:
+            moving, past, share = terms.in_green
+            in_time = self.arriving_veh(moving, self.at_turns(inflow_veh), past, share)
+            unsaturated = terms.q_veh + terms.fraction * ops.maximum(in_time, 0.0)
+        # SPEC 2.3, the three terms.
+        oversaturated = terms.claim * ops.matmul(self.feeds.T, open_room_veh) + INFINITE_ROOM_VEH * self._is_exit
+        leaving = ops.minimum(unsaturated, ops.minimum(terms.saturated_veh, oversaturated))
+        room = terms.room_veh
+        if terms.opening is not None:
+            room = room + self.by_link(terms.opening * leaving)
+        # Only a source has an outside; a rounded minimum must not make one of a link that has none.
+        entering = ops.minimum(terms.wanting_veh, room) * self._is_source
+        inflow = entering + ops.matmul(self.feeds, leaving)
+        return StepFlows(leaving, inflow, arriving, entering, queued, room)
+
+    def after(self, state: ModelState, demand_veh: Any, flows: StepFlows) -> ModelState:
+        """The state at the end of a step that began with `state`: conservation."""
+        inflow = flows.inflow_veh
+        return ModelState(
+            x_veh=state.x_veh + inflow - self.by_link(flows.leaving_veh),
+            q_veh=flows.queued_veh - flows.leaving_veh,
+            source_queue_veh=state.source_queue_veh + demand_veh * self._is_source - flows.entering_veh,
             past_inflow_veh=(*[inflow / self.samples] * self.samples, *state.past_inflow_veh)[: self.lags],
         )
-        return after, StepFlows(leaving, inflow, arriving)
 
 
 def share_on_the_way(since_s: Floats, interval_s: float, intervals: int) -> Floats:

@@ -13,16 +13,16 @@ from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
 
-from utn_controllers.mpc.coordination import Consensus
 from utn_controllers.mpc.distributed import DistributedMPC, Settings
 from utn_controllers.mpc.problem import (
     REGULARISATION,
     JunctionProblem,
     QuadraticProgram,
     Timing,
+    places,
     remaining_steps,
 )
-from utn_controllers.mpc.whole import optimum
+from utn_controllers.mpc.whole import optimum, programs
 from utn_sumo import signals
 from utn_sumo.contract import EXIT, Floats, Forecast, Network, Plan, State
 from utn_sumo.errors import ControllerError, SettingError
@@ -143,7 +143,7 @@ def patient(net: Network, **chosen: Any) -> DistributedMPC:
 
 def gap_to_the_optimum(mpc: DistributedMPC, state: State, forecast: Forecast) -> float:
     """How much dearer the next plan is than the best one, as a share."""
-    problems, timing = [agent.problem for agent in mpc.agents], mpc.timing()
+    problems, timing = [agent.problem for agent in mpc.agents], mpc.timings()
     best, _ = optimum(problems, state, forecast, timing)
     reached, _ = optimum(problems, state, forecast, timing, all_greens(mpc.plan(state, forecast)))
     return (reached - best) / abs(best)
@@ -174,8 +174,8 @@ def test_a_plan_answers_to_the_present_state_and_not_to_an_earlier_one(net: Netw
 @pytest.mark.parametrize("seed", range(4))
 def test_time_spent_is_never_saved_by_filling_a_link_beyond_its_storage(utn17: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    timing = Timing.of(LinkModel(utn17, utn17.control_step_s), some_greens(utn17, rng))
     problems = problems_of(utn17, HORIZON)
+    timing = timings(problems, Timing.of(LinkModel(utn17, utn17.control_step_s), some_greens(utn17, rng)))
     _, solutions = optimum(problems, some_state(utn17, rng), some_forecast(utn17, rng), timing)
     for problem, solution in zip(problems, solutions, strict=True):
         assert solution[problem.layout.over_storage].max() < 1e-3
@@ -185,7 +185,7 @@ def test_a_better_plan_than_the_equal_split_is_found(utn17: Network) -> None:
     rng = np.random.default_rng(3)
     state, forecast = some_state(utn17, rng), some_forecast(utn17, rng)
     mpc = DistributedMPC(utn17)
-    problems, timing = [agent.problem for agent in mpc.agents], mpc.timing()
+    problems, timing = [agent.problem for agent in mpc.agents], mpc.timings()
     greens, equal = all_greens(mpc.plan(state, forecast)), np.tile(utn17.equal_split().green_s, (4, 1))
     found, split = (optimum(problems, state, forecast, timing, plan)[0] for plan in (greens, equal))
     assert found < split
@@ -248,13 +248,13 @@ def test_who_reaches_the_queue_after_its_green_leaves_a_step_later(utn17: Networ
     demand = np.zeros((3, 17))
     demand[0] = 24.0 * utn17.is_source
     mpc = DistributedMPC(utn17, horizon=3)
-    problems, timing = [agent.problem for agent in mpc.agents], mpc.timing()
-    _, solutions = optimum(problems, quiet_state(utn17), Forecast(demand), timing)
+    problems, timing = [agent.problem for agent in mpc.agents], Timing.of(LinkModel(utn17, 120.0), equal_s(utn17))
+    _, solutions = optimum(problems, quiet_state(utn17), Forecast(demand), timings(problems, timing))
     # One vehicle every five seconds, each as long on the way as the free road takes.
     in_time = (np.maximum(timing.end_s[0] - utn17.free_time_s[utn17.turn_link], 0) / 5) * utn17.fraction
     for problem, solution in zip(problems, solutions, strict=True):
-        from_outside = utn17.is_source[utn17.turn_link[problem.turns]]
-        turns = problem.turns[from_outside]
+        from_outside = utn17.is_source[utn17.turn_link[problem.place.turns]]
+        turns = problem.place.turns[from_outside]
         leaving = solution[problem.layout.leaving][:, from_outside]
         assert leaving[0] == pytest.approx(in_time[turns], abs=0.01)
         assert leaving[1] == pytest.approx(24 * utn17.fraction[turns] - in_time[turns], abs=0.01)
@@ -265,10 +265,12 @@ def test_the_green_is_expected_where_the_last_plan_foresaw_it(utn17: Network) ->
     mpc, model = DistributedMPC(utn17, step_s=60.0, horizon=2), LinkModel(utn17, 60.0)
     foreseen = utn17.equal_split().green_s
     for _ in range(3):
-        timing, expected = mpc.timing(), Timing.of(model, foreseen)
-        assert timing.shown == pytest.approx(expected.shown)
-        assert timing.end_s == pytest.approx(expected.end_s)
-        assert timing.opening == pytest.approx(expected.opening)
+        whole = Timing.of(model, foreseen)
+        for agent, timing in zip(mpc.agents, mpc.timings(), strict=True):
+            expected = whole.part(agent.place)
+            assert timing.shown == pytest.approx(expected.shown)
+            assert timing.end_s == pytest.approx(expected.end_s)
+            assert timing.opening == pytest.approx(expected.opening)
         foreseen = all_greens(ask(mpc))[1]
 
 
@@ -278,11 +280,20 @@ def test_every_problem_is_convex(any_net: Network, cost: str, seed: int) -> None
     net, rng = any_net, np.random.default_rng(seed)
     state, forecast = some_state(net, rng), some_forecast(net, rng, 3)
     timing = Timing.of(LinkModel(net, 60.0), some_greens(net, rng))
-    for problem in problems_of(net, 3, cost, 60.0, control_horizon=2):
-        program = problem.program(state, forecast, timing)
+    problems = problems_of(net, 3, cost, 60.0, control_horizon=2)
+    for program in programs(problems, state, forecast, timings(problems, timing)):
         assert program.hessian == pytest.approx(program.hessian.T, abs=1e-12)
         assert np.linalg.eigvalsh(program.hessian).min() > -1e-9
         assert (program.lower <= program.upper).all()
+
+
+def timings(problems: list[JunctionProblem], timing: Timing) -> list[Timing]:
+    """The whole network's timing, cut for each junction."""
+    return [timing.part(problem.place) for problem in problems]
+
+
+def equal_s(net: Network) -> Floats:
+    return net.equal_split().green_s
 
 
 PROBLEMS: dict[tuple[Any, ...], list[JunctionProblem]] = {}
@@ -296,7 +307,7 @@ def problems_of(
     if key not in PROBLEMS:
         chosen: dict[str, Any] = {"control_horizon": control_horizon, "cost": cost, "step_s": step_s}
         settings = Settings(horizon=horizon, **chosen)
-        PROBLEMS[key] = [JunctionProblem(net, junction, settings) for junction in range(len(net.junctions))]
+        PROBLEMS[key] = [JunctionProblem(place, settings) for place in places(net)]
     return PROBLEMS[key]
 
 
@@ -339,9 +350,9 @@ class Run:
 def decision(problem: JunctionProblem, green: Floats, run: Run) -> Floats:
     """The model's flows as this junction's decision vector."""
     z = np.zeros(problem.layout.size)
-    z[problem.layout.green] = green[problem.stages]
-    z[problem.layout.leaving] = [flows.leaving_veh[problem.turns] for flows in run.flows]
-    z[problem.layout.inflow] = [flows.inflow_veh[problem.links] for flows in run.flows]
+    z[problem.layout.green] = green[problem.place.stages]
+    z[problem.layout.leaving] = [flows.leaving_veh[problem.place.turns] for flows in run.flows]
+    z[problem.layout.inflow] = [flows.inflow_veh[problem.place.links] for flows in run.flows]
     return z
 
 
@@ -357,20 +368,21 @@ def assert_feasible_and_the_most(
     """The model's flows are feasible, and neither more could leave the network nor more come in than there is room."""
     net, timing, run = model.network, Timing.of(model, green), Run.of(model, state, green, forecast)
     shown = green_windows(net, green, model.step_s).shown_s
-    for problem in problems:
-        program, z = problem.program(state, forecast, timing), decision(problem, green, run)
+    frozen = timings(problems, timing)
+    for problem, program in zip(problems, programs(problems, state, forecast, frozen), strict=True):
+        z = decision(problem, green, run)
         assert excess(program, z) < 1e-6
         for step, (before, flows) in enumerate(zip(run.states, run.flows, strict=False)):
-            for position in np.flatnonzero(net.turn_next[problem.turns] == EXIT):
+            for position in np.flatnonzero(net.turn_next[problem.place.turns] == EXIT):
                 more = z.copy()
                 more[problem.layout.leaving[step, position]] += 0.1
                 assert excess(program, more) > 0.09
             end = timing.end_s[step % len(shown)]
             opened = model.opening(shown[step % len(shown)] @ net.serves, end) * flows.leaving_veh
             room = model.room_veh(before.x_veh) + model.leaves @ opened
-            for position in np.flatnonzero(~net.is_source[problem.links]):
+            for position in np.flatnonzero(~net.is_source[problem.place.links]):
                 crowded = z.copy()
-                crowded[problem.layout.inflow[step, position]] = room[problem.links[position]] + 0.1
+                crowded[problem.layout.inflow[step, position]] = room[problem.place.links[position]] + 0.1
                 assert excess(program, crowded) > 0.09
 
 
@@ -423,9 +435,10 @@ def test_the_cost_of_a_plan_is_what_the_exact_model_spends(
     expected += REGULARISATION / 2 * sum((f.leaving_veh**2).sum() + (f.inflow_veh**2).sum() for f in run.flows)
     found: Any = 0.0
     timing = Timing.of(model, green)
-    for problem in problems_of(net, horizon, cost, step_s):
-        program, z = problem.program(state, forecast, timing), decision(problem, green, run)
-        found += z @ program.hessian @ z / 2 + program.gradient @ z + program.constant
+    problems = problems_of(net, horizon, cost, step_s)
+    for problem, program in zip(problems, programs(problems, state, forecast, timings(problems, timing)), strict=True):
+        z = decision(problem, green, run)
+        found += program.cost(z)
     assert found == pytest.approx(expected, rel=1e-9)
 
 
@@ -437,9 +450,10 @@ def test_no_model_step_lets_out_more_than_green_all_through_it_would(utn17: Netw
     q = np.where(utn17.turn_link == link, 100.0, 0.0) * utn17.fraction
     problems = problems_of(utn17, 2, step_s=step_s)
     timing = Timing.of(LinkModel(utn17, step_s), utn17.equal_split().green_s)
-    _, solutions = optimum(problems, quiet_state(utn17, q=q), Forecast(np.zeros((2, 17))), timing)
+    state = quiet_state(utn17, q=q)
+    _, solutions = optimum(problems, state, Forecast(np.zeros((2, 17))), timings(problems, timing))
     problem, solution = problems[utn17.links[link].junction], solutions[utn17.links[link].junction]
-    leaving = solution[problem.layout.leaving][:, utn17.turn_link[problem.turns] == link].sum(axis=1)
+    leaving = solution[problem.layout.leaving][:, utn17.turn_link[problem.place.turns] == link].sum(axis=1)
     assert leaving.max() <= utn17.saturation_flow_veh_s[link] * step_s + 1e-3
 
 
@@ -538,31 +552,19 @@ def test_a_lone_junction_is_planned_without_neighbours(utn17: Network) -> None:
     assert_admissible(lone, plan)
 
 
-def test_a_shift_moves_what_was_agreed_a_control_step_up_and_repeats_the_last() -> None:
-    consensus = Consensus(np.array([[1.0, 2.0, 3.0]]), np.array([[4.0, 5.0, 6.0]]), rho=0.1)
-    consensus.shift(1)
-    assert consensus.mean.tolist() == [[2, 3, 3]]
-    assert consensus.price.tolist() == [[5, 6, 6]]
-    finer = Consensus(np.arange(1.0, 7.0)[None], np.arange(11.0, 17.0)[None], rho=0.1)
-    finer.shift(2)
-    assert finer.mean.tolist() == [[3, 4, 5, 6, 5, 6]]
-    assert finer.price.tolist() == [[13, 14, 15, 16, 15, 16]]
-
-
 @pytest.mark.parametrize(("step_s", "steps"), [(None, 1), (60.0, 2), (40.0, 3)])
-def test_every_step_starts_from_what_was_agreed_in_the_last_one_shifted(
-    utn17: Network, monkeypatch: pytest.MonkeyPatch, step_s: float | None, steps: int
+def test_every_step_starts_from_what_was_agreed_in_the_last_one_shifted_and_its_last_repeated(
+    utn17: Network, step_s: float | None, steps: int
 ) -> None:
-    shifted: list[int] = []
-
-    def shift(consensus: Consensus, steps: int) -> None:
-        shifted.append(steps)
-
-    monkeypatch.setattr(Consensus, "shift", shift)
     mpc = DistributedMPC(utn17, step_s=step_s, horizon=2)
-    for asked in range(3):
-        ask(mpc)
-        assert shifted == [steps] * asked
+    ask(mpc)
+    region = mpc.crew.regions[0]
+    agreed = region.mean.copy(), region.price.copy()
+    state, forecast = quiet_state(utn17), Forecast(np.zeros((2, 17)))
+    assert region.begin(state, forecast) == {}
+    for before, after in zip(agreed, (region.mean, region.price), strict=True):
+        assert after[:, :-steps].tolist() == before[:, steps:].tolist()
+        assert after[:, -steps:].tolist() == before[:, -steps:].tolist()
 
 
 @pytest.mark.parametrize("step_s", [120.0, 60.0])

@@ -1,43 +1,30 @@
-"""ADMM among the agents (SPEC 4): consensus on the flow between every producer and its consumer.
+"""How the agents come to terms (SPEC 4): rounds of solving, telling the neighbours, and agreeing, until it is enough.
 
-Boyd et al. 2011, sections 3.4.1 (varying penalty), 3.4.3 (over-relaxation) and 3.3.1 (stopping).
+`admm`         consensus on the flow between every producer and its consumer: Boyd et al. 2011, sections 3.4.1
+               (varying penalty), 3.4.3 (over-relaxation) and 3.3.1 (stopping)
+`sensitivity`  the paper's mu: a producer is told what a vehicle more would cost its consumer, who takes what comes;
+               damped, with a proximal term
+`none`         every agent for itself, with the inflow that it has seen of late
+
+Nothing is decided here but when to stop and the penalty, from one sum of squares a region.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from utn_controllers.mpc.acceleration import Mixer
+from utn_controllers.mpc.crew import Crew
+from utn_controllers.mpc.region import SUMS, Message
 from utn_controllers.mpc.settings import Settings
-from utn_sumo.contract import Floats
-
-if TYPE_CHECKING:
-    from utn_controllers.mpc.agent import Agent
+from utn_sumo.contract import Floats, Forecast, State
 
 ADAPT_RATIO = 10.0
 """The penalty adapts while one residual is this many times the other, then it is frozen for good."""
 ADAPT_FACTOR = 2.0
 BYTES_PER_NUMBER = 8
-
-
-@dataclass
-class Consensus:
-    """What the agents agree on, kept warm from one control step to the next."""
-
-    mean: Floats
-    """(interactions, model steps) zb [veh]."""
-    price: Floats
-    """(interactions, model steps) lam."""
-    rho: float
-    frozen: bool = False
-    """Whether rho has settled."""
-
-    def shift(self, steps: int) -> None:
-        """One control step of so many model steps on: everything moves up by it, and the last one is repeated."""
-        for array in (self.mean, self.price):
-            array[:, :-steps] = array[:, steps:].copy()
 
 
 @dataclass(frozen=True)
@@ -51,50 +38,63 @@ class Outcome:
     bytes_exchanged: int
 
 
-def admm(agents: list[Agent], consensus: Consensus, settings: Settings) -> Outcome:
-    """Iterate until both residuals are under tolerance or the cap is reached; changes `consensus`.
+class Coordinator:
+    """Leads a crew of regions from one control step to the next."""
 
-    Raises ControllerError if an agent has no optimum.
-    """
-    shape = consensus.mean.shape
-    numbers = consensus.mean.size
-    primal = dual = np.inf
-    converged = False
-    iteration = 0
-    for iteration in range(1, settings.iterations + 1):  # noqa: B007 - used after the loop
-        flow = np.zeros((2, *shape))
-        for agent in agents:
-            rows = agent.interactions
-            flow[agent.side, rows] = agent.solve(consensus.mean[rows], consensus.price[rows])
-        produced, consumed = settings.relaxation * flow + (1 - settings.relaxation) * consensus.mean
-        before = consensus.mean
-        consensus.mean = (produced + consumed) / 2
-        consensus.price = consensus.price + consensus.rho * (produced - consensus.mean)
+    def __init__(self, crew: Crew, settings: Settings):
+        self.crew = crew
+        self.settings = settings
+        self._frozen = settings.coordination != "admm"
+        self._rho = settings.first_rho
+        self._numbers = sum(crew.call("size"))
 
-        primal = float(np.sqrt(np.sum((flow - consensus.mean) ** 2)))
-        dual = float(consensus.rho * np.sqrt(2 * np.sum((consensus.mean - before) ** 2)))
-        scale = np.sqrt(2 * numbers) * settings.tolerance_abs
-        sizes = max(np.sqrt(np.sum(flow**2)), np.sqrt(2 * np.sum(consensus.mean**2)))
-        prices = np.sqrt(2 * np.sum(consensus.price**2))
-        converged = bool(
-            primal <= scale + settings.tolerance_rel * sizes
-            and dual <= scale * consensus.rho + settings.tolerance_rel * prices
-        )
-        if converged:
-            break
-        if not consensus.frozen:
-            _adapt(agents, consensus, primal, dual)
-    return Outcome(iteration, primal, dual, converged, 2 * iteration * numbers * BYTES_PER_NUMBER)
+    def plan(self, states: list[State], forecasts: list[Forecast]) -> tuple[list[Floats], Outcome]:
+        """Greens (Kc, S) by region, and how they were come by, from what concerns each region.
 
+        Raises ControllerError if an agent has no optimum.
+        """
+        crew, settings = self.crew, self.settings
+        crew.call("greet", self._deliver(crew.call("begin", states, forecasts)))
+        primal = dual = np.inf
+        converged = False
+        iterations = 1 if settings.coordination == "none" else settings.iterations
+        iteration = 0
+        mixer = Mixer()
+        for iteration in range(1, iterations + 1):  # noqa: B007 - used after the loop
+            inboxes = self._deliver(crew.call("solve"))
+            sums = sum(crew.call("agree", inboxes))
+            apart, flow, moved, mean, price = np.sqrt(sums[: len(SUMS)])
+            primal, dual = float(apart), float(moved)
+            scale = np.sqrt(self._numbers) * settings.tolerance_abs
+            converged = bool(
+                primal <= scale + settings.tolerance_rel * max(flow, mean)
+                and dual <= scale * self._rho + settings.tolerance_rel * price
+            )
+            if settings.coordination == "admm":
+                crew.call("mix", [mixer.weights(sums[len(SUMS) :])] * len(crew))
+            if converged:
+                break
+            if not self._frozen and self._adapt(primal, dual):
+                mixer = Mixer()
+        exchanged = 0 if settings.coordination == "none" else iteration * self._numbers * BYTES_PER_NUMBER
+        return crew.call("finish"), Outcome(iteration, primal, dual, converged, exchanged)
 
-def _adapt(agents: list[Agent], consensus: Consensus, primal: float, dual: float) -> None:
-    """Move rho towards balanced residuals; the first time that they are balanced, freeze it."""
-    if primal > ADAPT_RATIO * dual:
-        consensus.rho *= ADAPT_FACTOR
-    elif dual > ADAPT_RATIO * primal:
-        consensus.rho /= ADAPT_FACTOR
-    else:
-        consensus.frozen = True
-        return
-    for agent in agents:
-        agent.factorise(consensus.rho)
+    def _deliver(self, outboxes: list[dict[int, Message]]) -> list[list[Message]]:
+        """Every region's messages to it, by sender."""
+        inboxes: list[list[Message]] = [[] for _ in outboxes]
+        for outbox in outboxes:
+            for region, message in outbox.items():
+                inboxes[region].append(message)
+        return inboxes
+
+    def _adapt(self, primal: float, dual: float) -> bool:
+        """Move rho towards balanced residuals, if need be; the first time that they are balanced, freeze it."""
+        if primal > ADAPT_RATIO * dual:
+            self._rho *= ADAPT_FACTOR
+        elif dual > ADAPT_RATIO * primal:
+            self._rho /= ADAPT_FACTOR
+        else:
+            self._frozen = True
+            return False
+        self.crew.call("adapt", [self._rho] * len(self.crew))
+        return True

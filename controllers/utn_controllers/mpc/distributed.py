@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from utn_controllers.mpc.agent import Agent
-from utn_controllers.mpc.coordination import Consensus, admm
-from utn_controllers.mpc.problem import JunctionProblem, Timing
+from utn_controllers.mpc.coordination import Coordinator
+from utn_controllers.mpc.crew import Crew, DaskActors, InProcess, Processes
+from utn_controllers.mpc.problem import Timing, places
+from utn_controllers.mpc.region import Region
 from utn_controllers.mpc.settings import Settings
 from utn_sumo.contract import Forecast, Network, Plan, State
-from utn_sumo.model import LinkModel, check_step
+from utn_sumo.model import check_step
 
 __all__ = ["DistributedMPC", "Settings"]
 
@@ -25,38 +28,53 @@ class DistributedMPC:
         self.settings = Settings(**settings)
         self.horizon = self.settings.horizon
         self.network = network
-        step_s = self.settings.step_s or network.control_step_s
-        check_step(network, step_s)
-        self._model = LinkModel(network, step_s)
-        self._expected_s = network.equal_split().green_s
-        """(S,) greens that the coming step is likely to have: where they stand is frozen in the problem."""
-        fed = [link for link, item in enumerate(network.links) if not item.is_source]
-        place = {link: row for row, link in enumerate(fed)}
-        self._fed = np.array(fed, dtype=np.int64)
-        self.agents = [
-            Agent(JunctionProblem(network, junction, self.settings), place)
-            for junction in range(len(network.junctions))
+        check_step(network, self.settings.step_s or network.control_step_s)
+        self.places = places(network)
+        shared = np.array_split(np.arange(len(self.places)), min(self.settings.workers, len(self.places)))
+        self._groups = [[self.places[junction] for junction in group] for group in shared]
+        self._shares = [
+            tuple(np.concatenate([getattr(place, name) for place in group]) for name in ("links", "turns", "stages"))
+            for group in self._groups
         ]
-        self._consensus: Consensus | None = None
+        """Links, turns and stages of each region, a junction's after the other's."""
+        self.crew = self._crew()
+        self._coordinator = Coordinator(self.crew, self.settings)
+
+    @property
+    def agents(self) -> list[Agent]:
+        """The agents of this process, by junction."""
+        assert isinstance(self.crew, InProcess)
+        return [agent for region in self.crew.regions for agent in region.agents]
+
+    def timings(self) -> list[Timing]:
+        """What the next plan's problems are frozen at, by junction."""
+        return [agent.receding.timing() for agent in self.agents]
 
     def plan(self, state: State, forecast: Forecast) -> Plan:
         """Coordinated greens for the coming cycle and the control horizon; ControllerError without an optimum."""
-        timing = self.timing()
-        if self._consensus is None:
-            rate = state.past_inflow_veh.mean(axis=0)[self._fed] / self.network.sample_s
-            inflow = np.repeat(rate[:, None] * self._model.step_s, self.agents[0].problem.steps, axis=1)
-            self._consensus = Consensus(inflow, np.zeros_like(inflow), self.settings.rho)
-        else:
-            self._consensus.shift(self.agents[0].problem.substeps)
-        for agent in self.agents:
-            agent.prepare(state, forecast, timing, self._consensus.rho)
-        outcome = admm(self.agents, self._consensus, self.settings)
+        states = [state.part(links, turns) for links, turns, _ in self._shares]
+        found, outcome = self._coordinator.plan(states, [forecast.part(links) for links, _, _ in self._shares])
         greens = np.zeros((self.settings.control_horizon, len(self.network.stages)))
-        for agent in self.agents:
-            greens[:, agent.problem.stages] = agent.problem.greens(agent.solution)
-        self._expected_s = greens[min(1, len(greens) - 1)]
+        for answer, (_, _, stages) in zip(found, self._shares, strict=True):
+            greens[:, stages] = answer
         return Plan(greens[0], greens[1:], facts=vars(outcome))
 
-    def timing(self) -> Timing:
-        """Where the next plan's problem has the greens."""
-        return Timing.of(self._model, self._expected_s)
+    def _crew(self) -> Crew:
+        """Neighbouring junctions in one region as far as their order tells; who feeds whom across the borders."""
+        home = {place.part.name: region for region, group in enumerate(self._groups) for place in group}
+        ends: dict[int, list[int]] = {}
+        for place in self.places:
+            for link in (*place.consumed, *place.produced):
+                ends.setdefault(link, []).append(home[place.part.name])
+        builders = []
+        for region, group in enumerate(self._groups):
+            partners = {
+                link: next(other for other in ends[link] if other != region)
+                for place in group
+                for link in (*place.consumed, *place.produced)
+                if any(other != region for other in ends[link])
+            }
+            builders.append(partial(Region, group, partners, self.settings))
+        if self.settings.agents == "dask":
+            return DaskActors(builders, self.settings.scheduler)
+        return Processes(builders) if self.settings.agents == "processes" else InProcess(builders)

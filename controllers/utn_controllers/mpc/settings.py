@@ -6,6 +6,9 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+RHO = {"tts": 0.2, "paper": 0.6}
+"""Penalties that need the fewest iterations, by cost, found on random states of `utn17`."""
+
 
 class ProblemSettings(BaseModel):
     """What states the problem, whoever solves it; every field is checked when the controller is built."""
@@ -19,6 +22,8 @@ class ProblemSettings(BaseModel):
     step_s: float | None = Field(None, gt=0)
     """Step of the prediction's model; a divisor of the control step, by default all of it."""
     cost: Literal["tts", "paper"] = "tts"
+    constraints: Literal["kept", "dropped"] = "kept"
+    """Whether greens must fill their cycles and keep their least, and links their storage; what dropping them costs."""
     q: float = Field(0.1, ge=0)
     """Q of the paper's cost: weight of x^2."""
     r: float = Field(0.3, ge=0)
@@ -58,6 +63,13 @@ class ProblemSettings(BaseModel):
             return 0
         return self.terminal * (ca.dot(remaining, x) + ca.dot(remaining, waiting))
 
+    def price(self, remaining: Any) -> Any:
+        """What a vehicle more on a link is likely to cost, before anything is agreed; `remaining` (Z,) as above.
+
+        On a free road a vehicle costs the steps that it still needs.
+        """
+        return remaining if self.cost == "tts" else 0.0 * remaining
+
     def green_cost(self, green: Any) -> Any:
         """Cost of one step's greens."""
         import casadi as ca  # noqa: PLC0415 - heavy
@@ -70,11 +82,24 @@ class ProblemSettings(BaseModel):
 class Settings(ProblemSettings):
     """Settings of the distributed MPC: the problem's, and how the agents come to terms."""
 
-    iterations: int = Field(20, ge=1, le=1000)
-    """Most ADMM iterations in a control step."""
-    rho: float = Field(0.2, gt=0)
-    """First ADMM penalty."""
+    coordination: Literal["admm", "sensitivity", "none"] = "admm"
+    """How the agents come to terms."""
+    agents: Literal["here", "processes", "dask"] = "here"
+    """Where they live: in this process, in a pool of processes, or as Dask actors."""
+    workers: int = Field(1, ge=1, le=1000)
+    """Regions that the agents are parted into: one a process, or one an actor."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler; without it the actors are processes of this machine."""
+    iterations: int = Field(60, ge=1, le=1000)
+    """Most iterations in a control step."""
+    rho: float | None = Field(None, gt=0)
+    """First penalty; by default what suits the cost."""
     relaxation: float = Field(1.6, gt=0, lt=2)
-    tolerance_abs: float = Field(1e-2, gt=0)
+    tolerance_abs: float = Field(0.03, gt=0)
     """Absolute tolerance of the residuals [veh]."""
-    tolerance_rel: float = Field(1e-3, ge=0)
+    tolerance_rel: float = Field(2e-3, ge=0)
+
+    @property
+    def first_rho(self) -> float:
+        """The penalty to begin with."""
+        return self.rho or RHO[self.cost]

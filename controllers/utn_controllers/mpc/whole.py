@@ -1,82 +1,173 @@
-"""The same problem solved whole: the junctions' problems side by side under equal flows at every interaction.
+"""The same problem solved whole: the junctions' problems side by side under equal flows at every interaction (SPEC 3).
 
-What the agents' coordination is measured against. PIQP solves it, another algorithm than the agents' own.
+Assembled once; then only numbers change. The controller `cmpc` plans with it; the agents' plans are measured
+against it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
-from utn_controllers.mpc.problem import JunctionProblem, Timing
-from utn_sumo.contract import Floats, Forecast, State
+from utn_controllers.mpc.problem import JunctionProblem, Pattern, QuadraticProgram, Timing
+from utn_sumo.contract import EXIT, Floats, Forecast, Ints, State
 from utn_sumo.errors import ControllerError
+
+TOLERANCE = 1e-9
+
+
+class WholeProblem:
+    """min 1/2 z'Pz + c'z  s.t.  Az = b, h_l <= Gz <= h_u, z_l <= z <= z_u  over all junctions, solved by PIQP.
+
+    Coupling and green budgets are the equalities, whose matrix never changes; nor does P.
+    """
+
+    def __init__(
+        self, problems: Sequence[JunctionProblem], *, tolerance: float = TOLERANCE, fixed_greens: bool = False
+    ):
+        """With `fixed_greens` the greens are given with every solve, and the budgets left to whoever gives them."""
+        self.problems = problems
+        sizes = [problem.layout.size for problem in problems]
+        self.starts = np.concatenate([[0], np.cumsum(sizes)])
+        self._fixed = fixed_greens
+        self._greens = np.concatenate(
+            [start + problem.layout.green.ravel() for problem, start in zip(problems, self.starts, strict=False)]
+        )
+        kept = problems[0].settings.constraints == "kept"
+        budgets = problems[0].settings.control_horizon if kept else 0
+        # The budgets come first among a junction's rows (Statement._predict).
+        self._below = [problem.pattern.rows >= budgets for problem in problems]
+        self._rows = sp.block_diag([_rows_below(problem.pattern, budgets) for problem in problems], format="csc")
+        self._budgets = budgets
+        self.equal = sp.vstack([coupling(problems, self.starts), *self._budget_rows()], format="csc")
+        self._solver: Any = None
+        self.iterations = 0
+        """Of the last solve."""
+        self._tolerance = tolerance
+        self.hessian = sp.block_diag([sp.csc_matrix(problem.hessian) for problem in problems], format="csc")
+
+    def _budget_rows(self) -> list[Any]:
+        if self._fixed or not self._budgets:
+            return []
+        rows = []
+        for problem, start in zip(self.problems, self.starts, strict=False):
+            green = problem.layout.green
+            steps = np.repeat(np.arange(len(green)), green.shape[1])
+            shape = (len(green), int(self.starts[-1]))
+            rows.append(sp.csr_matrix((np.ones(green.size), (steps, start + green.ravel())), shape=shape))
+        return rows
+
+    def numbers(self, programs: Sequence[QuadraticProgram], greens: Floats | None = None) -> dict[str, Any]:
+        """The problem under the names of its statement, but for P and A, which never change."""
+        sizes = np.diff(self.starts)
+
+        def gathered(side: str, rows: slice, *, past: bool) -> Floats:
+            """Bounds of the variables, or past them those of some rows, over all junctions."""
+            bounds = [getattr(program, side) for program in programs]
+            return np.concatenate([b[n:][rows] if past else b[:n] for b, n in zip(bounds, sizes, strict=True)])
+
+        box = [gathered(side, slice(None), past=False) for side in ("lower", "upper")]
+        if greens is not None:
+            at = np.concatenate([greens[:, problem.place.stages].ravel() for problem in self.problems])
+            box[0][self._greens] = box[1][self._greens] = at
+        self._rows.data[:] = np.concatenate([p.values[mask] for p, mask in zip(programs, self._below, strict=True)])
+        equal = np.zeros(self.equal.shape[0])
+        if not self._fixed and self._budgets:
+            budgets = gathered("upper", slice(self._budgets), past=True)
+            equal[len(equal) - len(budgets) :] = budgets
+        return {
+            "c": np.concatenate([program.gradient for program in programs]),
+            "b": equal,
+            "G": self._rows,
+            "h_l": gathered("lower", slice(self._budgets, None), past=True),
+            "h_u": gathered("upper", slice(self._budgets, None), past=True),
+            "x_l": box[0],
+            "x_u": box[1],
+        }
+
+    def solve(self, programs: Sequence[QuadraticProgram], greens: Floats | None = None) -> tuple[float, list[Floats]]:
+        """Least cost and each junction's solution; `greens` (Kc, S of the whole network) if they are fixed.
+
+        Raises ControllerError if the solver finds no optimum.
+        """
+        import piqp  # noqa: PLC0415 - compiled, loaded at use
+
+        numbers = self.numbers(programs, greens)
+        if self._solver is None:
+            self._solver = piqp.SparseSolver()
+            self._solver.settings.eps_abs = self._solver.settings.eps_rel = self._tolerance
+            self._solver.setup(P=self.hessian, A=self.equal, **numbers)
+        else:
+            self._solver.update(**numbers)
+        status = self._solver.solve()
+        if status != piqp.PIQP_SOLVED:
+            raise ControllerError(f"the whole problem has no optimum ({status})")
+        result = self._solver.result
+        self.iterations = int(result.info.iter)
+        cost = result.info.primal_obj + sum(program.constant for program in programs)
+        return float(cost), self.parts(result.x)
+
+    def parts(self, solution: Floats) -> list[Floats]:
+        """Each junction's part of a solution."""
+        return [solution[start:end] for start, end in pairwise(self.starts)]
+
+
+def programs(
+    problems: Sequence[JunctionProblem], state: State, forecast: Forecast, timings: Sequence[Timing]
+) -> list[QuadraticProgram]:
+    """Every junction's programme, of the whole network's state."""
+    return [
+        problem.program(
+            state.part(problem.place.links, problem.place.turns), forecast.part(problem.place.links), timing
+        )
+        for problem, timing in zip(problems, timings, strict=True)
+    ]
 
 
 def optimum(
     problems: Sequence[JunctionProblem],
     state: State,
     forecast: Forecast,
-    timing: Timing,
+    timings: Sequence[Timing],
     greens: Floats | None = None,
 ) -> tuple[float, list[Floats]]:
-    """Least cost of the whole network and each junction's solution.
+    """Least cost of the whole network and each junction's solution, from scratch.
 
     With `greens` (Kc, S) given, the greens are fixed at these: the cost that a plan leads to when the flows under it
     are the best possible ones. Raises ControllerError if the solver finds no optimum.
     """
-    import piqp  # noqa: PLC0415 - compiled, loaded at use
-    import scipy.sparse as sp  # noqa: PLC0415 - heavy
-
-    programs = [problem.program(state, forecast, timing) for problem in problems]
-    sizes = [problem.layout.size for problem in problems]
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    lower_box = np.concatenate([program.lower[:size] for program, size in zip(programs, sizes, strict=True)])
-    upper_box = np.concatenate([program.upper[:size] for program, size in zip(programs, sizes, strict=True)])
-    lower = np.concatenate([program.lower[size:] for program, size in zip(programs, sizes, strict=True)])
-    upper = np.concatenate([program.upper[size:] for program, size in zip(programs, sizes, strict=True)])
-    rows = sp.block_diag([program.matrix for program in programs], format="csr")
-    coupling = sp.csr_matrix(_coupling(problems, starts))
-
-    if greens is not None:
-        for problem, start in zip(problems, starts[:-1], strict=True):
-            columns = start + problem.layout.green
-            lower_box[columns] = upper_box[columns] = greens[:, problem.stages]
-        budget = lower == upper
-        rows, lower, upper = rows[~budget], lower[~budget], upper[~budget]
-    equal = lower == upper
-    solver = piqp.SparseSolver()
-    solver.settings.eps_abs = solver.settings.eps_rel = 1e-9
-    solver.setup(
-        sp.block_diag([program.hessian for program in programs], format="csc"),
-        np.concatenate([program.gradient for program in programs]),
-        sp.vstack([coupling, rows[equal]], format="csc"),
-        np.concatenate([np.zeros(coupling.shape[0]), upper[equal]]),
-        rows[~equal].tocsc(),
-        lower[~equal],
-        upper[~equal],
-        lower_box,
-        upper_box,
-    )
-    status = solver.solve()
-    if status != piqp.PIQP_SOLVED:
-        raise ControllerError(f"the whole problem has no optimum ({status})")
-    cost = solver.result.info.primal_obj + sum(program.constant for program in programs)
-    return float(cost), [solver.result.x[start : start + size] for start, size in zip(starts, sizes, strict=False)]
+    whole = WholeProblem(problems, fixed_greens=greens is not None)
+    return whole.solve(programs(problems, state, forecast, timings), greens)
 
 
-def _coupling(problems: Sequence[JunctionProblem], starts: Floats) -> Floats:
+def _rows_below(pattern: Pattern, budgets: int) -> Any:
+    """The pattern without its first rows, which are the budgets; a matrix of ones."""
+    ones = sp.csc_matrix((np.ones(len(pattern.rows)), pattern.rows, pattern.starts), shape=pattern.shape)
+    return ones[budgets:]
+
+
+def coupling(problems: Sequence[JunctionProblem], starts: Ints) -> Any:
     """Rows that say: inflow of a link, as its consumer has it, less the outflow to it, as its producer has it, is 0."""
-    consumer = {link: place for place, problem in enumerate(problems) for link in problem.consumed()}
-    producer = {link: place for place, problem in enumerate(problems) for link in problem.produced()}
-    blocks = []
-    for link, place in sorted(consumer.items()):
-        block = np.zeros((problems[place].steps, int(starts[-1])))
-        for owner, rows, sign in (
-            (place, problems[place].inflow_rows(link), 1.0),
-            (producer[link], problems[producer[link]].outflow_rows(link), -1.0),
-        ):
-            block[:, int(starts[owner]) : int(starts[owner + 1])] += sign * rows
-        blocks.append(block)
-    return np.vstack(blocks)
+    steps, size = problems[0].steps, int(starts[-1])
+    row_of = {link: row for row, link in enumerate(sorted(link for p in problems for link in p.place.consumed))}
+    rows, columns, signs = [], [], []
+
+    def add(link: int, start: int, positions: Ints, sign: float) -> None:
+        rows.append(row_of[link] * steps + np.arange(steps))
+        columns.append(start + positions)
+        signs.append(np.full(steps, sign))
+
+    for problem, start in zip(problems, starts.tolist(), strict=False):
+        place, layout = problem.place, problem.layout
+        for link in place.consumed:
+            add(link, start, layout.inflow[:, int(np.flatnonzero(place.links == link)[0])], 1.0)
+        for turn in np.flatnonzero(place.turn_next != EXIT):
+            add(int(place.turn_next[turn]), start, layout.leaving[:, turn], -1.0)
+    if not rows:
+        return sp.csr_matrix((0, size))
+    entries = np.concatenate(signs), (np.concatenate(rows), np.concatenate(columns))
+    return sp.csr_matrix(entries, shape=(len(row_of) * steps, size))

@@ -1,0 +1,112 @@
+"""Where the regions live: in this process, in a pool, or as Dask actors over machines. Same code, same messages.
+
+Threads are no fourth way: the solver takes some twenty microseconds a call, and two threads spend more than that on
+handing the interpreter to each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any, Protocol
+
+from utn_controllers.mpc.region import Region
+from utn_sumo.errors import ControllerError
+
+
+class Crew(Protocol):
+    """Some regions, all of which do the same thing at a time."""
+
+    def __len__(self) -> int: ...
+
+    def call(self, method: str, *arguments: Sequence[Any]) -> list[Any]:
+        """Call a region's method on every region, each with its own item of every argument; the answers in order."""
+        ...
+
+
+class InProcess:
+    """One after the other."""
+
+    def __init__(self, regions: Sequence[Callable[[], Region]]):
+        self.regions = [build() for build in regions]
+
+    def __len__(self) -> int:
+        return len(self.regions)
+
+    def call(self, method: str, *arguments: Sequence[Any]) -> list[Any]:
+        return [getattr(region, method)(*own) for region, *own in zip(self.regions, *arguments, strict=True)]
+
+
+class Processes:
+    """One process a region on this machine. The states go out once a step; between the rounds only messages travel."""
+
+    def __init__(self, regions: Sequence[Callable[[], Region]]):
+        context = get_context("spawn")
+        self._pipes: list[Connection] = []
+        for build in regions:
+            here, there = context.Pipe()
+            # Daemons end with this process, however it ends.
+            context.Process(target=_serve, args=(there, build), daemon=True).start()
+            self._pipes.append(here)
+        for failed in [_received(pipe) for pipe in self._pipes]:
+            if failed is not None:
+                raise failed
+
+    def __len__(self) -> int:
+        return len(self._pipes)
+
+    def call(self, method: str, *arguments: Sequence[Any]) -> list[Any]:
+        for pipe, *own in zip(self._pipes, *arguments, strict=True):
+            pipe.send((method, own))
+        # All answers are fetched before any error is raised: none must be left for the next call.
+        answers = [_received(pipe) for pipe in self._pipes]
+        for answer in answers:
+            if isinstance(answer, Exception):
+                raise answer
+        return answers
+
+
+def _received(pipe: Connection) -> Any:
+    try:
+        return pipe.recv()
+    except EOFError:
+        return ControllerError("a process of the agents has ended: see what it printed")
+
+
+def _serve(pipe: Connection, build: Callable[[], Region]) -> None:
+    """Build a region and answer calls to it until the other side is gone."""
+    region: Region | None = None
+    method, own = "", list[Any]()
+    while True:
+        try:
+            if region is None:
+                region, answer = build(), None
+            else:
+                answer = getattr(region, method)(*own)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the caller must hear of it
+            answer = error
+        try:
+            pipe.send(answer)
+            method, own = pipe.recv()
+        except (EOFError, BrokenPipeError):
+            return
+
+
+class DaskActors:
+    """One Dask actor a region, on the cluster of `address`, or on processes of this machine."""
+
+    def __init__(self, regions: Sequence[Callable[[], Region]], address: str | None):
+        from distributed import Client  # noqa: PLC0415 - heavy, and few use it
+
+        local: dict[str, Any] = {"n_workers": len(regions), "threads_per_worker": 1, "host": "127.0.0.1"}
+        self._client: Any = Client(address) if address else Client(**local, processes=True, dashboard_address=None)
+        futures = [self._client.submit(build, actor=True, pure=False) for build in regions]
+        self._actors = [future.result() for future in futures]
+
+    def __len__(self) -> int:
+        return len(self._actors)
+
+    def call(self, method: str, *arguments: Sequence[Any]) -> list[Any]:
+        answers = [getattr(actor, method)(*own) for actor, *own in zip(self._actors, *arguments, strict=True)]
+        return [answer.result() for answer in answers]
