@@ -27,6 +27,7 @@ from utn_sumo import signals
 from utn_sumo.contract import EXIT, Floats, Forecast, Network, Plan, State
 from utn_sumo.errors import ControllerError, SettingError
 from utn_sumo.model import LinkModel, ModelState, StepFlows, green_windows
+from utn_sumo.testing import HARD, random_forecast, random_state
 
 SEEDS = st.integers(0, 2**32 - 1)
 HORIZON = 7
@@ -68,35 +69,6 @@ def cost(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def levels(rng: np.random.Generator, *shape: int) -> Floats:
-    """Numbers from 0 to 1, both ends among them."""
-    return np.clip(rng.uniform(-0.3, 1.3, shape), 0, 1)
-
-
-def some_split(net: Network, rng: np.random.Generator) -> Floats:
-    """Shares of the turns, which sum to 1 over a link."""
-    weight = levels(rng, len(net.turns)) + 1e-3
-    return np.asarray(weight / np.bincount(net.turn_link, weight)[net.turn_link])
-
-
-def some_state(net: Network, rng: np.random.Generator) -> State:
-    """Queues within x, x within storage, and past inflows that can still be on their way."""
-    links = len(net.links)
-    x = rng.uniform(0, 1) * levels(rng, links) * net.storage_veh
-    queue = levels(rng, links) * x
-    entered = levels(rng, net.delay_samples, links) + 1e-9
-    return State(
-        cycle=0,
-        time_s=0.0,
-        x_veh=x,
-        q_veh=some_split(net, rng) * queue[net.turn_link],
-        source_queue_veh=net.is_source * levels(rng, links) * 30,
-        past_inflow_veh=entered / entered.sum(axis=0) * levels(rng, links) * (x - queue),
-        turned_veh=np.zeros(len(net.turns)),
-        fraction=some_split(net, rng),
-    )
-
-
 def quiet_state(net: Network, x: Floats | None = None, q: Floats | None = None) -> State:
     """Nobody on the road but `x` (Z,) and, among these, the queues `q` (M,)."""
     links, turns = np.zeros(len(net.links)), np.zeros(len(net.turns))
@@ -107,7 +79,7 @@ def quiet_state(net: Network, x: Floats | None = None, q: Floats | None = None) 
 
 
 def some_forecast(net: Network, rng: np.random.Generator, horizon: int = HORIZON) -> Forecast:
-    return Forecast(net.is_source * 40 * levels(rng, horizon, len(net.links)))
+    return random_forecast(net, rng, horizon)
 
 
 def some_greens(net: Network, rng: np.random.Generator) -> Floats:
@@ -130,11 +102,47 @@ def assert_admissible(net: Network, plan: Plan) -> None:
 def test_greens_fill_every_cycle_and_keep_every_least(net: Network, cost: str) -> None:
     rng, mpc = np.random.default_rng(19), DistributedMPC(net, cost=cost)
     for _ in range(10):
-        plan = mpc.plan(some_state(net, rng), some_forecast(net, rng))
+        plan = mpc.plan(random_state(net, rng), some_forecast(net, rng))
         assert plan.green_s.shape == (17,)
         assert plan.ahead_s is not None
         assert plan.ahead_s.shape == (3, 17)
         assert_admissible(net, plan)
+
+
+@pytest.mark.parametrize("coordination", ["admm", "sensitivity", "none"])
+@pytest.mark.parametrize("case", HARD)
+def test_there_is_a_plan_for_every_hard_case(net: Network, cost: str, coordination: str, case: str) -> None:
+    mpc = DistributedMPC(net, cost=cost, coordination=coordination)
+    for seed in range(3):
+        assert_admissible(net, mpc.plan(*HARD[case](net, np.random.default_rng(seed), HORIZON)))
+
+
+def test_at_the_default_stop_plans_are_within_a_thousandth_of_the_best(utn17: Network, cost: str) -> None:
+    for seed in range(10):
+        rng = np.random.default_rng([seed, 4])
+        assert (
+            gap_to_the_optimum(DistributedMPC(utn17, cost=cost), random_state(utn17, rng), some_forecast(utn17, rng))
+            < 1e-3
+        )
+
+
+def test_a_price_on_what_neighbours_get_is_better_than_none_and_consensus_better_than_a_price(
+    utn17: Network, cost: str
+) -> None:
+    gaps: dict[str, list[float]] = {"admm": [], "sensitivity": [], "none": []}
+    for seed in range(5):
+        for mode, found in gaps.items():
+            rng = np.random.default_rng(seed)
+            mpc = DistributedMPC(utn17, cost=cost, coordination=mode)
+            found.append(gap_to_the_optimum(mpc, random_state(utn17, rng), some_forecast(utn17, rng)))
+    admm, sensitivity, none = (np.mean(found) for found in gaps.values())
+    assert admm < sensitivity < 0.5 * none
+
+
+def test_agents_for_themselves_exchange_nothing_and_answer_once(utn17: Network) -> None:
+    facts = ask(DistributedMPC(utn17, coordination="none")).facts
+    assert facts["bytes_exchanged"] == 0
+    assert facts["iterations"] == 1
 
 
 def patient(net: Network, **chosen: Any) -> DistributedMPC:
@@ -152,7 +160,7 @@ def gap_to_the_optimum(mpc: DistributedMPC, state: State, forecast: Forecast) ->
 @pytest.mark.parametrize("seed", range(2))
 def test_many_iterations_reach_the_optimum_of_the_whole_problem(net: Network, cost: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    gap = gap_to_the_optimum(patient(net, cost=cost), some_state(net, rng), some_forecast(net, rng))
+    gap = gap_to_the_optimum(patient(net, cost=cost), random_state(net, rng), some_forecast(net, rng))
     assert -1e-6 <= gap <= 1e-3
 
 
@@ -160,7 +168,7 @@ def test_many_iterations_reach_the_optimum_of_the_whole_problem(net: Network, co
 def test_so_they_do_with_a_finer_model_step_and_with_mixed_cycles(mixed: Network, cost: str, step_s: float) -> None:
     rng = np.random.default_rng(17)
     mpc = patient(mixed, cost=cost, horizon=2, step_s=step_s)
-    gap = gap_to_the_optimum(mpc, some_state(mixed, rng), some_forecast(mixed, rng, 2))
+    gap = gap_to_the_optimum(mpc, random_state(mixed, rng), some_forecast(mixed, rng, 2))
     assert -1e-6 <= gap <= 1e-3
 
 
@@ -168,7 +176,7 @@ def test_a_plan_answers_to_the_present_state_and_not_to_an_earlier_one(net: Netw
     rng = np.random.default_rng(13)
     mpc = patient(net, cost=cost)
     for _ in range(3):
-        assert gap_to_the_optimum(mpc, some_state(net, rng), some_forecast(net, rng)) <= 1e-3
+        assert gap_to_the_optimum(mpc, random_state(net, rng), some_forecast(net, rng)) <= 1e-3
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -176,14 +184,14 @@ def test_time_spent_is_never_saved_by_filling_a_link_beyond_its_storage(utn17: N
     rng = np.random.default_rng(seed)
     problems = problems_of(utn17, HORIZON)
     timing = timings(problems, Timing.of(LinkModel(utn17, utn17.control_step_s), some_greens(utn17, rng)))
-    _, solutions = optimum(problems, some_state(utn17, rng), some_forecast(utn17, rng), timing)
+    _, solutions = optimum(problems, random_state(utn17, rng), some_forecast(utn17, rng), timing)
     for problem, solution in zip(problems, solutions, strict=True):
         assert solution[problem.layout.over_storage].max() < 1e-3
 
 
 def test_a_better_plan_than_the_equal_split_is_found(utn17: Network) -> None:
     rng = np.random.default_rng(3)
-    state, forecast = some_state(utn17, rng), some_forecast(utn17, rng)
+    state, forecast = random_state(utn17, rng), some_forecast(utn17, rng)
     mpc = DistributedMPC(utn17)
     problems, timing = [agent.problem for agent in mpc.agents], mpc.timings()
     greens, equal = all_greens(mpc.plan(state, forecast)), np.tile(utn17.equal_split().green_s, (4, 1))
@@ -209,7 +217,7 @@ def test_a_finer_model_step_saves_as_much_time_as_the_whole_cycle_at_least(utn17
     spent = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        state, forecast = some_state(utn17, rng), some_forecast(utn17, rng)
+        state, forecast = random_state(utn17, rng), some_forecast(utn17, rng)
         plans = [equal, *(all_greens(mpc.plan(state, forecast)) for mpc in planners.values())]
         spent.append([time_spent(utn17, state, forecast, greens) for greens in plans])
         assert spent[-1][2] < spent[-1][0]
@@ -278,7 +286,7 @@ def test_the_green_is_expected_where_the_last_plan_foresaw_it(utn17: Network) ->
 @limits(max_examples=3)
 def test_every_problem_is_convex(any_net: Network, cost: str, seed: int) -> None:
     net, rng = any_net, np.random.default_rng(seed)
-    state, forecast = some_state(net, rng), some_forecast(net, rng, 3)
+    state, forecast = random_state(net, rng), some_forecast(net, rng, 3)
     timing = Timing.of(LinkModel(net, 60.0), some_greens(net, rng))
     problems = problems_of(net, 3, cost, 60.0, control_horizon=2)
     for program in programs(problems, state, forecast, timings(problems, timing)):
@@ -389,7 +397,7 @@ def assert_feasible_and_the_most(
 @given(seed=SEEDS)
 def test_flows_of_the_exact_model_are_feasible_and_the_most_that_may_leave(any_net: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    state, green, forecast = some_state(any_net, rng), some_greens(any_net, rng), some_forecast(any_net, rng, 1)
+    state, green, forecast = random_state(any_net, rng), some_greens(any_net, rng), some_forecast(any_net, rng, 1)
     model = LinkModel(any_net, any_net.control_step_s)
     assert_feasible_and_the_most(problems_of(any_net, 1), model, state, green, forecast)
 
@@ -401,7 +409,7 @@ def test_while_the_delay_stands_so_they_are_in_every_model_step_of_the_horizon(
     any_net: Network, step_s: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    state, green, forecast = some_state(any_net, rng), some_greens(any_net, rng), some_forecast(any_net, rng, 3)
+    state, green, forecast = random_state(any_net, rng), some_greens(any_net, rng), some_forecast(any_net, rng, 3)
     model = ConstantDelay(any_net, step_s, state)
     assert_feasible_and_the_most(problems_of(any_net, 3, step_s=step_s), model, state, green, forecast)
 
@@ -409,7 +417,7 @@ def test_while_the_delay_stands_so_they_are_in_every_model_step_of_the_horizon(
 @given(seed=SEEDS)
 def test_so_they_are_where_a_control_step_has_several_cycles_and_model_steps(motley: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    state, green, forecast = some_state(motley, rng), some_greens(motley, rng), some_forecast(motley, rng, 2)
+    state, green, forecast = random_state(motley, rng), some_greens(motley, rng), some_forecast(motley, rng, 2)
     model = ConstantDelay(motley, 120.0, state)
     assert_feasible_and_the_most(problems_of(motley, 2, step_s=120.0), model, state, green, forecast)
 
@@ -421,7 +429,7 @@ def test_the_cost_of_a_plan_is_what_the_exact_model_spends(
     any_net: Network, cost: str, horizon: int, step_s: float | None, seed: int
 ) -> None:
     net, rng = any_net, np.random.default_rng(seed)
-    state, green, forecast = some_state(net, rng), some_greens(net, rng), some_forecast(net, rng, horizon)
+    state, green, forecast = random_state(net, rng), some_greens(net, rng), some_forecast(net, rng, horizon)
     model = ConstantDelay(net, step_s or net.control_step_s, state)
     run = Run.of(model, state, green, forecast)
     x, waiting = (np.array([getattr(s, name) for s in run.states[1:]]) for name in ("x_veh", "source_queue_veh"))
@@ -472,7 +480,7 @@ def test_no_model_step_lets_out_more_than_green_all_through_it_would(utn17: Netw
 )
 def test_any_horizon_gives_a_plan_for_its_control_horizon(utn17: Network, chosen: dict[str, int], greens: int) -> None:
     rng = np.random.default_rng(7)
-    plan = DistributedMPC(utn17, **chosen).plan(some_state(utn17, rng), some_forecast(utn17, rng, chosen["horizon"]))
+    plan = DistributedMPC(utn17, **chosen).plan(random_state(utn17, rng), some_forecast(utn17, rng, chosen["horizon"]))
     assert len(all_greens(plan)) == greens
     assert_admissible(utn17, plan)
 
@@ -482,7 +490,7 @@ def test_a_finer_model_step_gives_admissible_plans(any_net: Network, cost: str, 
     rng = np.random.default_rng(23)
     mpc = DistributedMPC(any_net, cost=cost, step_s=step_s, horizon=3)
     for _ in range(3):
-        assert_admissible(any_net, mpc.plan(some_state(any_net, rng), some_forecast(any_net, rng, 3)))
+        assert_admissible(any_net, mpc.plan(random_state(any_net, rng), some_forecast(any_net, rng, 3)))
 
 
 @pytest.mark.parametrize("step_s", [50.0, 240.0])
@@ -502,7 +510,7 @@ def test_the_model_step_must_divide_the_common_cycle_and_not_each_one(mixed: Net
 def test_junctions_with_cycles_of_their_own_get_plans_that_fill_them(mixed: Network, cost: str) -> None:
     rng, mpc = np.random.default_rng(29), DistributedMPC(mixed, cost=cost)
     for _ in range(5):
-        plan = mpc.plan(some_state(mixed, rng), some_forecast(mixed, rng))
+        plan = mpc.plan(random_state(mixed, rng), some_forecast(mixed, rng))
         assert_admissible(mixed, plan)
         for junction in mixed.junctions:
             lost = sum(mixed.stages[stage].clearance_s for stage in junction.stages)
@@ -529,7 +537,7 @@ def test_a_miscount_of_few_vehicles_never_leaves_the_controller_without_a_plan(
 
 
 def test_more_vehicles_than_a_link_holds_never_leave_the_controller_without_a_plan(utn17: Network, cost: str) -> None:
-    state = some_state(utn17, np.random.default_rng(0))
+    state = random_state(utn17, np.random.default_rng(0))
     x = 1.2 * utn17.storage_veh
     crowded = replace(state, x_veh=x, q_veh=(x[utn17.turn_link] * utn17.fraction))
     for step_s in (None, 30.0):
@@ -547,7 +555,7 @@ def test_a_lone_junction_is_planned_without_neighbours(utn17: Network) -> None:
     part = utn17.part(0)
     lone = replace(part, links=tuple(replace(link, is_source=True) for link in part.links))
     rng = np.random.default_rng(2)
-    plan = DistributedMPC(lone).plan(some_state(lone, rng), some_forecast(lone, rng))
+    plan = DistributedMPC(lone).plan(random_state(lone, rng), some_forecast(lone, rng))
     assert plan.facts["bytes_exchanged"] == 0
     assert_admissible(lone, plan)
 
@@ -573,7 +581,7 @@ def test_a_warm_start_saves_iterations(utn17: Network, step_s: float) -> None:
     chosen = {"iterations": 400, "horizon": 4, "step_s": step_s}
     warm, model = DistributedMPC(utn17, **chosen), LinkModel(utn17, step_s)
     forecast = Forecast(np.tile(20.0 * utn17.is_source, (4, 1)))
-    state, saved = some_state(utn17, rng), []
+    state, saved = random_state(utn17, rng), []
     for step in range(5):
         plan = warm.plan(state, forecast)
         if step > 0:
@@ -592,7 +600,7 @@ def test_a_warm_start_saves_iterations(utn17: Network, step_s: float) -> None:
 
 def test_what_the_coordination_did_is_told(utn17: Network) -> None:
     rng = np.random.default_rng(1)
-    facts = DistributedMPC(utn17, iterations=3).plan(some_state(utn17, rng), some_forecast(utn17, rng)).facts
+    facts = DistributedMPC(utn17, iterations=3).plan(random_state(utn17, rng), some_forecast(utn17, rng)).facts
     assert facts["iterations"] == 3
     assert not facts["converged"]
     # SPEC 4: at each of nine interactions both sides send Kp numbers of eight bytes.
@@ -646,7 +654,7 @@ def solver(monkeypatch: pytest.MonkeyPatch) -> type[Solver]:
 
 def ask(mpc: DistributedMPC) -> Plan:
     rng = np.random.default_rng(5)
-    return mpc.plan(some_state(mpc.network, rng), some_forecast(mpc.network, rng, mpc.horizon))
+    return mpc.plan(random_state(mpc.network, rng), some_forecast(mpc.network, rng, mpc.horizon))
 
 
 @pytest.mark.parametrize("flag", [-1, -2, -3, -4, -5, -6, 0])

@@ -15,6 +15,8 @@ MEMORY = 10
 """Rounds that are mixed."""
 REGULARISATION = 1e-8
 """Of the inner products, relative to the largest: rounds that say the same must not be weighed against each other."""
+NOTHING = 1e-100
+"""Added for rounds that change nothing at all."""
 SAFEGUARD = 2.0
 """After a mix whose residual is this many times the last one the memory starts anew."""
 
@@ -72,6 +74,6 @@ class Mixer:
         self._products = table
         regular = table.copy()
         diagonal = regular.reshape(-1)[:: len(table) + 1]
-        diagonal += REGULARISATION * diagonal.sum() + np.finfo(float).tiny
+        diagonal += REGULARISATION * diagonal.sum() + NOTHING
         found = np.linalg.solve(regular, np.ones(len(table)))
         return np.asarray(found / found.sum())

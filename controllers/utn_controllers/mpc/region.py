@@ -82,20 +82,28 @@ class Region:
         states = [state.part(links, turns) for links, turns in self._shares]
         for agent, own, (links, _) in zip(self.agents, states, self._shares, strict=True):
             agent.prepare(own, forecast.part(links), self.rho)
-        if not self._fresh:
+        mode = self.settings.coordination
+        if self._fresh or mode == "none":
+            self._expect(states)
+        else:
             shift = self.agents[0].problem.substeps
             for array in (self.mean, self.price):
                 array[:, :-shift] = array[:, shift:].copy()
+        if not self._fresh or mode == "none":
             return {}
         self._fresh = False
+        expected = np.concatenate([self.mean, self.price], axis=1)
+        return self._tell(np.array([expected, expected]), {CONSUMER})
+
+    def _expect(self, states: list[State]) -> None:
+        """Set what comes in to what came of late, and its price to what a vehicle more is likely to cost."""
         for agent, own, rows in zip(self.agents, states, self._rows, strict=True):
             place, consumed = agent.place, rows[: len(agent.place.consumed)]
             fed = ~place.part.is_source
             rate = own.past_inflow_veh.mean(axis=0)[fed] / place.part.sample_s
             self.mean[consumed] = rate[:, None] * agent.problem.model.step_s
-            self.price[consumed] = self.settings.price(place.remaining_steps[fed])[:, None]
-        expected = np.concatenate([self.mean, self.price], axis=1)
-        return self._tell(np.array([expected, expected]), {CONSUMER})
+            if self.settings.coordination != "none":
+                self.price[consumed] = self.settings.price(place.remaining_steps[fed])[:, None]
 
     def greet(self, inbox: list[Message]) -> None:
         """Take over what the neighbours expect to come in, and its price: both sides then start from the same."""
@@ -133,9 +141,10 @@ class Region:
             mean, price, flow = self.mean + DAMPING * apart, self.price + DAMPING * moved, flow[PRODUCER]
         sums = [np.vdot(owned * each, each) for each in (apart, flow)]
         sums += [np.vdot(self._counts * each, each) for each in (moved, mean, price)]
-        if self.settings.coordination != "admm":
-            # A mix could set an agent an inflow under zero.
+        if self.settings.coordination == "sensitivity":
+            # Not mixed: a mix could set an agent an inflow under zero.
             self.mean, self.price = mean, price
+        if self.settings.coordination != "admm":
             return np.array(sums)
         scale = np.array([self.rho, 1 / self.rho])[:, None, None]
         before, after = np.array([self.mean, self.price]), np.array([mean, price])
