@@ -52,10 +52,15 @@ class Agent:
         and the constraint matrix, and the solver starts from the last active set.
         """
         self.program = self.receding.program(state, forecast)
+        self.load(rho)
+
+    def load(self, rho: float) -> None:
+        """Hand the programme to the solver."""
         if self._solver is None or rho != self._rho:
             self.factorise(rho)
         else:
-            self._solver.update(A=self.program.matrix, bupper=self.program.upper, blower=self.program.lower)
+            program = self._program()
+            self._solver.update(A=program.matrix, bupper=program.upper, blower=program.lower)
 
     def factorise(self, rho: float) -> None:
         """Set the solver up for a penalty `rho`, without a memory of earlier states."""

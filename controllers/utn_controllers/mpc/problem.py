@@ -74,6 +74,7 @@ class Layout:
     leaving: Ints
     inflow: Ints
     over_storage: Ints
+    """Of the links that a neighbour feeds: a source is never forced to take more than it holds."""
     size: int
 
     @classmethod
@@ -88,7 +89,8 @@ class Layout:
             return np.arange(start - rows * columns, start).reshape(rows, columns)
 
         green = block(control_horizon, len(part.stages))
-        leaving, inflow, over = block(steps, len(part.turns)), block(steps, links), block(steps, links)
+        leaving, inflow = block(steps, len(part.turns)), block(steps, links)
+        over = block(steps, int(np.count_nonzero(~part.is_source)))
         return cls(green, leaving, inflow, over, size=start)
 
 
@@ -255,6 +257,7 @@ class Statement:
             "still_in_green": over("still_in_green", structure.lags, turns),
             "shown": over("shown", structure.substeps, stages),
             "opening": over("opening", structure.substeps, turns),
+            "excess": ca.SX.sym("excess", links),
             "saturation": ca.SX.sym("saturation", turns),
             "storage": ca.SX.sym("storage", links),
             "room_share": ca.SX.sym("room_share", links),
@@ -275,6 +278,7 @@ class Statement:
         still_in_green: list[Any],
         shown: list[Any],
         opening: list[Any],
+        excess: Any,
         saturation: Any,
         storage: Any,
         room_share: Any,
@@ -290,6 +294,7 @@ class Statement:
         numbers = LinkNumbers(saturation, storage, room_share)
         model = LinkModel(structure.example, structure.step_s, CasadiOperations(), numbers)
         source = np.array(structure.is_source, dtype=float)
+        fed = sp.csr_array(np.eye(len(source))[:, source == 0])
         cost: Any = 0
         rows = [(ca.sum1(z[green]), budget, budget) for green in layout.green] if kept else []
         inflows: list[Any] = []
@@ -312,8 +317,8 @@ class Statement:
                 (leaving - model.saturated_veh(by_turn_s, fraction), -np.inf, 0.0),
             ]
             if kept:
-                room = model.room_veh(x) + model.by_link(opening[substep] * leaving)
-                rows.append((inflow - over - room, -np.inf, 0.0))
+                room = model.room_veh(x) + room_share * excess + model.by_link(opening[substep] * leaving)
+                rows.append((inflow - model.operations.matmul(fed, over) - room, -np.inf, 0.0))
             q = q - leaving
             x = x + inflow - model.by_link(leaving)
             waiting = waiting + source * (demand[step] - inflow)
@@ -423,6 +428,8 @@ class JunctionProblem:
             (before * past[:, link]).sum(axis=1),
             timing.shown,
             timing.opening,
+            # A source that holds more than it can, by a wrong count, may go on holding it.
+            part.is_source * np.maximum(x - part.storage_veh, 0.0),
             self._constants,
         ]
         np.concatenate([each.ravel() for each in parameters], out=self._parameters)
