@@ -1,7 +1,7 @@
 """The project's own benchmarks: every figure that the README quotes is printed by one of these.
 
     python tools/bench.py overhead     control and bridge against the bare `sumo` binary on the same signals
-    python tools/bench.py gap          the agents' plans against the same problem solved whole
+    python tools/bench.py solve        centralized and distributed MPC: gaps, times, scale, failures
     python tools/bench.py traffic      controllers against each other over demands and seeds
     python tools/bench.py step         the model's step: what a finer one costs and brings, in prediction and in control
     python tools/bench.py estimate     vehicles estimated from loops that miscount: counting against the filter
@@ -28,10 +28,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from utn_controllers.mpc.distributed import DistributedMPC
-from utn_controllers.mpc.whole import optimum
+import solving
 from utn_sumo import bridge, calibration, mismatch, network, recording, replay, sumo_tools
-from utn_sumo.contract import Forecast, Measurement, Network, State
+from utn_sumo.contract import Measurement
 from utn_sumo.detectors import Miscount
 from utn_sumo.estimation import Estimator
 from utn_sumo.recording import Log
@@ -90,72 +89,37 @@ def overhead(net: str, hours: float, demand: float, seed: int, repeats: int, as_
 
 
 @bench.command()
-@click.option("--net", default="utn17", show_default=True)
-@click.option("--hours", default=2.0, show_default=True)
-@click.option("--demand", default=1.3, show_default=True)
-@click.option("--seed", default=1, show_default=True)
-@click.option("--every", default=3, show_default=True, help="Judge every n-th control step.")
+@click.option("--only", default=",".join(solving.PARTS), show_default=True, help="Parts, separated by commas.")
+@click.option("--states", default=50, show_default=True, help="Random states for the gaps.")
+@click.option("--hard", default=1000, show_default=True, help="Hard states for the failures.")
+@click.option("--sizes", default="100,400,1000", show_default=True, help="Junctions of the large networks.")
+@click.option("--grids", default="one-way,imported", show_default=True, help="Kinds of them; figures are of the first.")
+@click.option("--steps", default=14, show_default=True, help="Control steps on them; the last three count.")
+@click.option("--hours", default=4.0, show_default=True, help="Of the run for the overhead.")
+@click.option("--plot", type=click.Path(path_type=Path), help="Draw gaps and time spent against the iterations here.")
 @click.option("--json", "as_json", is_flag=True)
-def gap(net: str, hours: float, demand: float, seed: int, every: int, as_json: bool) -> None:
-    """Cost of the agents' plans over the least cost of the same problem solved whole, along a run in closed loop.
-
-    A plan's cost is that of its greens under the best flows that they allow; the states are those that the
-    default controller met in SUMO, and every setting below sees the same ones, warm from one to the next.
-    """
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary) / "run"
-        bridge.run(scenario(net=net, hours=hours, demand=demand, seed=seed), folder)
-        lines = (folder / recording.CYCLES).read_text(encoding="utf-8").splitlines()
-    states = [_state(json.loads(line)) for line in lines]
-    rows = [
-        _gap_of(calibration.for_model(network.load(net), None), states, every, settings)
-        for cost in ("tts", "paper")
-        for settings in ({"cost": cost, "iterations": cap} for cap in (1, 5, 10, 20, 40, 80))
-    ]
+def solve(only: str, sizes: str, grids: str, plot: Path | None, as_json: bool, **given: Any) -> None:
+    """Centralized and distributed MPC: how near to the optimum, how fast, how large, how often without a plan."""
+    wanted = solving.Wanted(sizes=[int(size) for size in sizes.split(",")], grids=grids.split(","), **given)
+    found: dict[str, Any] = {}
+    for part in only.split(","):
+        if part not in solving.PARTS:
+            raise click.BadParameter(f"{part!r} is none of {', '.join(solving.PARTS)}")
+        found |= solving.PARTS[part](wanted)
+    if plot is not None:
+        solving.draw(found, plot)
     if as_json:
-        click.echo(json.dumps(rows))
+        click.echo(json.dumps(found))
         return
-    _show(
-        f"{net}, demand {demand:g}, seed {seed}: gap to the whole problem's optimum over {rows[0]['steps']} steps",
-        ["cost", "iterations at most", "used", "mean gap %", "median gap %", "worst gap %"],
-        [
-            [r["cost"], str(r["cap"]), f"{r['iterations']:.1f}"]
-            + [f"{100 * r[key]:.4f}" for key in ("gap_mean", "gap_median", "gap_max")]
-            for r in rows
-        ],
-    )
+    for name, rows in found.items():
+        if isinstance(rows, list):
+            _show(name, list(rows[0]), [[_text(value) for value in row.values()] for row in rows])
+    _show("figures", ["figure", "value"], [[k, _text(v)] for k, v in found.items() if not isinstance(v, list)])
 
 
-def _state(record: dict[str, Any]) -> tuple[State, Forecast]:
-    values: dict[str, Any] = {
-        key: np.array(value) if isinstance(value, list) else value for key, value in record["state"].items()
-    }
-    return State(**values), Forecast(np.array(record["forecast"]["demand_veh"]))
-
-
-def _gap_of(net: Network, states: list[tuple[State, Forecast]], every: int, settings: dict[str, Any]) -> dict[str, Any]:
-
-    controller = DistributedMPC(net, **settings)
-    problems = [agent.problem for agent in controller.agents]
-    gaps, iterations = [], []
-    for step, (state, forecast) in enumerate(states):
-        timing = controller.timing()
-        plan = controller.plan(state, forecast)
-        iterations.append(plan.facts["iterations"])
-        if step % every == 0:
-            greens = np.vstack([plan.green_s, np.asarray(plan.ahead_s)])
-            least, _ = optimum(problems, state, forecast, timing)
-            reached, _ = optimum(problems, state, forecast, timing, greens)
-            gaps.append(reached / least - 1)
-    return {
-        "cost": settings["cost"],
-        "cap": settings["iterations"],
-        "iterations": statistics.mean(iterations),
-        "steps": len(gaps),
-        "gap_mean": statistics.mean(gaps),
-        "gap_median": statistics.median(gaps),
-        "gap_max": max(gaps),
-    }
+def _text(value: Any) -> str:
+    """A number in four digits, anything else as it is."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 @bench.command()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
+from utn_sumo import network, sumo_tools
 from utn_sumo.contract import EXIT, Junction, Link, Network, Stage, Turn
 
 CYCLE_S, MIN_GREEN_S, YELLOW_S, ALL_RED_S = 120.0, 10.0, 3.0, 2.0
@@ -93,3 +96,22 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
         edge_length_m={link.id: link.length_m for link in links},
         startup_lag_s=2.0,
     )
+
+
+def imported_grid(rows: int, columns: int) -> Network:
+    """A two-way grid by netgenerate, four approaches and four stages a junction, read as any SUMO net is."""
+    with tempfile.TemporaryDirectory() as temporary:
+        file = Path(temporary) / f"two-way{rows}x{columns}.net.xml"
+        subprocess.run(
+            [
+                sumo_tools.sumo_binary("netgenerate"),
+                *("--grid", "--grid.x-number", str(columns), "--grid.y-number", str(rows)),
+                *("--grid.length", "300", "--grid.attach-length", "300", "--default.lanenumber", "2"),
+                *("--default-junction-type", "traffic_light", "--tls.layout", "incoming", "--no-turnarounds", "true"),
+                *("--tls.yellow.time", "3", "--tls.allred.time", "2", "--tls.cycle.time", "120"),
+                *("--seed", "1", "--output-file", str(file)),
+            ],
+            check=True,
+            capture_output=True,
+        )
+        return network.load(str(file))

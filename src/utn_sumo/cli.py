@@ -131,6 +131,28 @@ def calibrate(out: Path, demand: str, seeds: str, step: str, **flags: Any) -> No
 
 
 @cli.command()
+@click.option("--hours", default="4", show_default=True, help="Simulated hours of each run.")
+@click.option("--seed", default="1", show_default=True, help="Seed of demand and SUMO.")
+@click.option("--demand", default="1.0,1.7", show_default=True, help="Scales of the paper's demand, with commas.")
+@click.option("--sumo/--no-sumo", "in_sumo", default=True, help="Run in SUMO too: minutes, not seconds.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON list, an object a run, and nothing else.")
+def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: Any) -> None:
+    """Repeat the paper's comparison of CMPC and DMPC, and show how its CMPC came to lose.
+
+    The 4 h runs in SUMO take about ten minutes on two free cores.
+    """
+    from utn_sumo import paper as comparison  # noqa: PLC0415 - heavy
+    from utn_sumo import recording, report  # noqa: PLC0415 - heavy
+
+    runs = comparison.runs(_numbers("demand", demand), in_sumo=in_sumo, **flags)
+    folder = recording.new_folder(out, f"paper-seed{flags['seed']}")
+    with report.counter("runs", len(runs)) as tick:
+        results = comparison.study(runs, folder, tick)
+    click.echo(json.dumps(recording.plain(results))) if as_json else report.paper_table(results, folder)
+
+
+@cli.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 def replay(folder: Path) -> None:
     """Write the signals of the run in FOLDER as plain SUMO files that the bare `sumo` replays."""

@@ -86,13 +86,14 @@ class CasadiOperations:
 
 
 class SmoothOperations(CasadiOperations):
-    """CasADi symbols with a minimum and a maximum that Newton's method can follow: the kink is rounded.
+    """CasADi symbols with a minimum and a maximum that Newton's method can follow: their kinks are rounded.
 
-    Away from the kink they are off by `epsilon`^2 / (4 |a - b|), at it by `epsilon` / 2, in the unit of what is compared.
+    At a kink they are off by half an epsilon, `apart` from it by epsilon^2 / (4 apart). Shares have an epsilon of
+    their own, as what is off in a share is then multiplied by vehicles.
     """
 
     def __init__(self, epsilon: Any, share_epsilon: Any) -> None:
-        """The epsilons, of vehicles and of shares, are numbers or symbols."""
+        """`epsilon` in the unit of what is compared (veh or s), `share_epsilon` in shares: numbers or symbols."""
         super().__init__()
         self._epsilon, self._share_epsilon = epsilon, share_epsilon
 
@@ -125,7 +126,7 @@ class ModelState:
 
 @dataclass(frozen=True)
 class StepTerms:
-    """What decides a step's flows beside the flows themselves; arrays, lists over past samples, or None without ends."""
+    """What decides a step's flows beside the flows themselves; some of it is a list over past samples."""
 
     q_veh: Any
     """(M,) queued at the start."""
@@ -185,8 +186,8 @@ WAVE_SPEED_M_S = 6.0
 """Speed at which a queue's start-up travels upstream: a standing vehicle's 7.5 m in about 1.3 s."""
 STEP_TOLERANCE = 1e-9
 MOST_SWEEPS, RADIUS_POWER = 200, 64
-INFINITE_ROOM_VEH = 1e9
-"""Room beyond an exit: the third term of SPEC 2.3 does not bind there."""
+INFINITE_ROOM_VEH = 1e6
+"""Room beyond an exit: the third term of SPEC 2.3 does not bind there. A rounded minimum loses digits beside more."""
 
 
 def _incidence(rows: Any, columns: Any, shape: tuple[int, int]) -> Sparse:

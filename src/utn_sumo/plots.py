@@ -1,4 +1,4 @@
-"""Plots of a mismatch: error against horizon, error by link, predicted against measured. The one door to matplotlib."""
+"""Plots: how far a model is from its plant; what the links of a run held over time. The one door to matplotlib."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ import numpy as np
 
 from utn_sumo.contract import Network
 from utn_sumo.mismatch import Errors, rmse
+from utn_sumo.recording import Log
 
+COLUMNS = 6
 INK, MODEL, PERSISTENCE, HISTORY, FLOOR = "#333333", "#0b6fa4", "#c8553d", "#b08900", "#6b8e23"
 
 
 def mismatch(result: dict[str, Any], network: Network, found: Errors, folder: Path) -> None:
     """Write three PNG files for one demand into `folder`."""
-    import matplotlib as mpl  # noqa: PLC0415 - heavy
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415 - after the backend is chosen
-
+    plt = _pyplot()
     name = f"demand{result['demand']:g}"
     ahead = np.arange(1, len(result["rmse_veh"]) + 1)
 
@@ -36,10 +34,9 @@ def mismatch(result: dict[str, Any], network: Network, found: Errors, folder: Pa
     figure.savefig(folder / f"{name}-horizon.png", dpi=150)
     plt.close(figure)
 
-    columns = 6
-    rows = int(np.ceil(len(network.links) / columns))
+    rows = int(np.ceil(len(network.links) / COLUMNS))
     figure, grid = plt.subplots(
-        rows, columns, figsize=(13, 2.2 * rows), sharex=True, layout="constrained", squeeze=False
+        rows, COLUMNS, figsize=(13, 2.2 * rows), sharex=True, layout="constrained", squeeze=False
     )
     for index, (axes, link) in enumerate(zip(grid.flat, network.links, strict=False)):
         error = found.x_veh[:, :, index]
@@ -64,3 +61,70 @@ def mismatch(result: dict[str, Any], network: Network, found: Errors, folder: Pa
         axes.set(xlabel="measured x (veh)", ylabel="predicted x (veh)", title=f"{step + 1} ahead", aspect="equal")
     figure.savefig(folder / f"{name}-scatter.png", dpi=130)
     plt.close(figure)
+
+
+def trajectories(network: Network, log: Log, title: str, path: Path) -> None:
+    """Write a PNG of one run: what each link held at the end of every cycle, and under it how long it had green.
+
+    The scales are the same for all links. A line shows the smallest storage where anything comes near it.
+    """
+    plt = _pyplot()
+    hours = np.arange(1, len(log.green_s) + 1) * network.control_step_s / 3600
+    x, queue = log.true_x_veh[:, 0], log.true_queue_veh[:, 0]
+    load = x + log.true_waiting_veh[:, 0]
+    by_turn = log.green_s[:, 0] @ network.serves
+    green = np.maximum.reduceat(by_turn, np.searchsorted(network.turn_link, np.arange(len(network.links))), axis=1)
+    storage, most = network.storage_veh.min(), 1.05 * max(float(load.max()), 1.0)
+    rows = int(np.ceil((len(network.links) + 1) / COLUMNS))
+    figure, grid = plt.subplots(
+        2 * rows,
+        COLUMNS,
+        figsize=(15, 3.4 * rows),
+        sharex=True,
+        squeeze=False,
+        height_ratios=[2, 1] * rows,
+        # By hand: the layout engine takes as long as all the drawing.
+        gridspec_kw={"left": 0.045, "right": 0.99, "top": 0.93, "bottom": 0.055, "wspace": 0.1, "hspace": 0.32},
+    )
+    ticks_h = np.linspace(0, hours[-1], 3)
+    grid[0, 0].set_xticks(ticks_h, [f"{tick_h:g}" for tick_h in ticks_h])
+    held, shown = grid[::2].ravel(), grid[1::2].ravel()
+    for index, link in enumerate(network.links):
+        above, below = held[index], shown[index]
+        above.fill_between(
+            hours, x[:, index], load[:, index], color=INK, alpha=0.3, linewidth=0, label="waiting to enter it"
+        )
+        above.plot(hours, x[:, index], color=MODEL, linewidth=1.4, label="vehicles on the link")
+        above.plot(hours, queue[:, index], color=PERSISTENCE, linewidth=1.2, label="of these, queued")
+        if most > storage:
+            above.axhline(storage, color=INK, linewidth=0.8, linestyle="--", label="storage")
+        above.set_title(f"link {link.id}", fontsize=9)
+        above.set(ylim=(0, most), xlim=(0, hours[-1]))
+        below.plot(
+            hours, green[:, index], color=FLOOR, linewidth=0.9, drawstyle="steps-pre", label="green in the cycle (s)"
+        )
+        below.set(ylim=(0, network.green_budget_s.max()), yticks=(0, 50, 100))
+        below.tick_params(labelbottom=index + COLUMNS >= len(network.links))
+        for axes in (above, below):
+            axes.tick_params(labelsize=8, labelleft=index % COLUMNS == 0)
+            axes.grid(visible=True, linewidth=0.3)
+    for above, below in zip(held[::COLUMNS], shown[::COLUMNS], strict=True):
+        above.set_ylabel("veh", fontsize=8)
+        below.set_ylabel("s", fontsize=8)
+    for axes in (*held[len(network.links) :], *shown[len(network.links) :]):
+        axes.axis("off")
+    lines = [pair for axes in (held[0], shown[0]) for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    held[len(network.links)].legend(*zip(*lines, strict=True), loc="center", frameon=False, fontsize=9)
+    figure.suptitle(title, y=0.975)
+    figure.supxlabel("time (h)", fontsize=10)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _pyplot() -> Any:
+    import matplotlib as mpl  # noqa: PLC0415 - heavy
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415 - after the backend is chosen
+
+    return plt

@@ -37,6 +37,19 @@ ROWS = [
     ("bridge_time_s", "time in the bridge", "s", "{:.2f}"),
 ]
 
+PAPER_ROWS = [
+    ("max_queue_veh", "longest queue (veh)", "{:.0f}"),
+    ("max_vehicles_veh", "most vehicles on a link (veh)", "{:.0f}"),
+    ("max_vehicles_and_waiting_veh", "with those waiting to enter (veh)", "{:.0f}"),
+    ("total_time_spent_veh_h", "total time spent (veh h)", "{:.1f}"),
+    ("control_time_s", "time in the controller (s)", "{:.1f}"),
+]
+PAPER_VIOLATIONS = [
+    ("over_capacity_link_cycles", "over capacity (link cycles)"),
+    ("over_capacity_links", "over capacity (links)"),
+    ("unfit_cycles", "greens that can't be shown (cycles)"),
+]
+
 
 @contextmanager
 def progress(scenario: Scenario) -> Iterator[Callable[[RunProgress], None]]:
@@ -150,3 +163,45 @@ def calibration_table(content: dict[str, Any]) -> None:
         turns = "  ".join("{} {:.3f} ({:.3f})".format(edge, *pair) for edge, pair in values["turns"].items())
         view.add_row(link, *("{:.3f} ({:.3f})".format(*values[key]) for key in keys), turns)
     console.print(view)
+
+
+def paper_table(results: list[dict[str, Any]], folder: Path) -> None:
+    """The paper's table beside ours, one for each plant and demand."""
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    published = [each for each in results if each["plant"] == "paper"]
+    ours: dict[tuple[str, float], list[dict[str, Any]]] = {}
+    for each in results:
+        if each not in published:
+            ours.setdefault((each["plant"], each["demand"]), []).append(each)
+    for (plant, demand), columns in ours.items():
+        head = "{net}, seed {seed}, {hours:.2f} h".format(**columns[0])
+        console.print(_beside(f"{plant} plant, demand {demand:g}, {head}", [*published, *columns]))
+    console.print(
+        "constraints: greens fill their cycle and keep their least, links take what they hold", highlight=False
+    )
+    console.print("in brackets: by how much DMPC beside it differs from that", highlight=False)
+    console.print(f"figures and paper.json: {folder}", markup=False, highlight=False)
+
+
+def _beside(title: str, columns: list[dict[str, Any]]) -> Table:
+    view = Table(title=title, title_justify="left")
+    view.add_column("measure", no_wrap=True)
+    for each in columns:
+        view.add_column(f"paper's {each['title']}" if each["plant"] == "paper" else each["title"], justify="right")
+    rivals = {each["plant"] == "paper": each for each in columns if each["controller"] == "dmpc"}
+
+    def cell(each: dict[str, Any], key: str, pattern: str) -> str:
+        if key not in each:
+            return ""
+        rival = rivals.get(each["plant"] == "paper", each)
+        if rival is each or not each[key]:
+            return pattern.format(each[key])
+        # Zero is added for the sign: a change of -0.0 % is none.
+        return f"{pattern.format(each[key])} ({round(rival[key] / each[key] - 1, 3) + 0.0:+.1%})"
+
+    for key, label, pattern in PAPER_ROWS:
+        view.add_row(label, *(cell(each, key, pattern) for each in columns))
+    for key, label in PAPER_VIOLATIONS:
+        found = [each.get(key, "") for each in columns]
+        view.add_row(label, *(", ".join(item) or "none" if isinstance(item, list) else str(item) for item in found))
+    return view

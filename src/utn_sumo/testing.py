@@ -25,7 +25,7 @@ def random_split(network: Network, rng: np.random.Generator) -> Floats:
 
 
 def random_state(network: Network, rng: np.random.Generator) -> State:
-    """A state that an estimator could give: queues within x, x within storage, past inflows that can be on their way."""
+    """A state that an estimator could give: queues within x, x within storage, past inflows that fit the rest."""
     links = len(network.links)
     x = rng.uniform(0, 1) * levels(rng, links) * network.storage_veh
     queue = levels(rng, links) * x
@@ -79,9 +79,7 @@ def _one_link_full(network: Network, rng: np.random.Generator, horizon: int) -> 
 def _flood(network: Network, rng: np.random.Generator, horizon: int) -> tuple[State, Forecast]:
     state = random_state(network, rng)
     waiting = 1000 * network.is_source * levels(rng, len(network.links))
-    return replace(state, source_queue_veh=waiting), Forecast(
-        10 * random_forecast(network, rng, horizon).demand_veh
-    )
+    return replace(state, source_queue_veh=waiting), Forecast(10 * random_forecast(network, rng, horizon).demand_veh)
 
 
 def _stale(network: Network, rng: np.random.Generator, horizon: int) -> tuple[State, Forecast]:

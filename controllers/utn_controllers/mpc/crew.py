@@ -97,10 +97,13 @@ class DaskActors:
     """One Dask actor a region, on the cluster of `address`, or on processes of this machine."""
 
     def __init__(self, regions: Sequence[Callable[[], Region]], address: str | None):
-        from distributed import Client  # noqa: PLC0415 - heavy, and few use it
-
+        try:
+            from distributed import Client  # noqa: PLC0415 - heavy, and few use it
+        except ImportError as error:
+            raise ControllerError("agents = 'dask' needs Dask: run pip install 'utn-sumo[dask]'") from error
         local: dict[str, Any] = {"n_workers": len(regions), "threads_per_worker": 1, "host": "127.0.0.1"}
-        self._client: Any = Client(address) if address else Client(**local, processes=True, dashboard_address=None)
+        connect: Any = Client
+        self._client = connect(address) if address else connect(**local, processes=True, dashboard_address=None)
         futures = [self._client.submit(build, actor=True, pure=False) for build in regions]
         self._actors = [future.result() for future in futures]
 

@@ -95,9 +95,9 @@ class Settings(ProblemSettings):
     rho: float | None = Field(None, gt=0)
     """First penalty; by default what suits the cost."""
     relaxation: float = Field(1.6, gt=0, lt=2)
-    tolerance_abs: float = Field(0.03, gt=0)
+    tolerance_abs: float = Field(0.02, gt=0)
     """Absolute tolerance of the residuals [veh]."""
-    tolerance_rel: float = Field(2e-3, ge=0)
+    tolerance_rel: float = Field(1.5e-3, ge=0)
 
     @property
     def first_rho(self) -> float:

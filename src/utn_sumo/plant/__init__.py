@@ -1,1 +1,1 @@
-"""Plants: whatever carries a plan out and is measured. `sumo` is the real one; all share one method, `run`."""
+"""Plants: whatever carries a plan out. `sumo` is the real one, `macroscopic` the model; both have one method, `run`."""
