@@ -18,8 +18,9 @@ from utn_controllers.mpc.whole import programs
 from utn_sumo.contract import Floats, Forecast, Network
 from utn_sumo.plant.macroscopic import MacroscopicPlant
 
-CHECKED = 3
-"""Control steps that are judged: the last ones."""
+HORIZON = 7
+TIMED, WARM = 3, 2
+"""Control steps, the last ones, whose plans are timed; that are solved centrally too, all but the last to warm up."""
 
 
 def scale(kind: str, junctions: int, *, workers: int, steps: int) -> dict[str, Any]:
@@ -32,51 +33,47 @@ def scale(kind: str, junctions: int, *, workers: int, steps: int) -> dict[str, A
     alone = DistributedMPC(net)
     built_s = time.perf_counter() - started
     pool = DistributedMPC(net, agents="processes", workers=workers)
-    problems = [agent.problem for agent in alone.agents]
-    judge = Judge(problems, tolerance=1e-6)
-    central = central_solvers(problems)
-    demand = _demand(net, steps + 7)
+    demand = _demand(net, steps + HORIZON)
     plant = MacroscopicPlant(net, demand)
-    rows = []
+    spent: dict[str, list[float]] = {"one": [], "pool": []}
+    iterations, cases = [], []
     for step in range(steps):
-        state, forecast = plant.state, Forecast(demand[step : step + 7])
-        timings = alone.timings()
-        plans, spent = {}, {}
+        state, forecast = plant.state, Forecast(demand[step : step + HORIZON])
+        cases.append((state, forecast, alone.timings()))
+        plans = {}
         for name, mpc in (("one", alone), ("pool", pool)):
             begun = time.perf_counter()
             plans[name] = mpc.plan(state, forecast)
-            spent[name] = time.perf_counter() - begun
-        if step >= steps - CHECKED - 1:
-            stated = programs(problems, state, forecast, timings)
-            solutions = {name: solver.solve(stated) for name, solver in central.items()}
-            if step >= steps - CHECKED:
-                least = judge.least(stated)
-                losses = {name: judge.gap(stated, greens_of(plan), least) for name, plan in plans.items()}
-                for name, parts in solutions.items():
-                    losses[name] = judge.gap(stated, _greens(net, problems, parts), least)
-                facts = plans["one"].facts
-                rows.append({"spent": spent, "losses": losses, "iterations": facts["iterations"]})
+            spent[name].append(time.perf_counter() - begun)
+        iterations.append(plans["one"].facts["iterations"])
         plant.run(plans["one"])
-    times = {name: statistics.median(row["spent"][name] for row in rows) for name in ("one", "pool")}
-    times |= {name: statistics.median(solver.watch.spent_s[1:]) for name, solver in central.items()}
-    losses = {name: max(row["losses"][name] for row in rows) for name in rows[0]["losses"]}
+    memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+    times = {name: statistics.median(each[-TIMED:]) for name, each in spent.items()}
+    own = min(times, key=lambda name: times[name])
+
+    problems = [agent.problem for agent in alone.agents]
+    central, solutions = central_solvers(problems), {}
+    for case in cases[-WARM:]:
+        stated = programs(problems, *case)
+        for name, solver in central.items():
+            solutions[name] = solver.solve(stated)
+            times[name] = solver.watch.spent_s[-1]
     best = min(central, key=lambda name: times[name])
-    own = min(("one", "pool"), key=lambda name: times[name])
+    judge = Judge(problems, tolerance=1e-6)
+    least = judge.least(stated)
     return {
         "kind": kind,
         "junctions": len(net.junctions),
         "links": len(net.links),
-        "iterations": statistics.mean(row["iterations"] for row in rows),
+        "iterations": statistics.mean(iterations[-TIMED:]),
         **{f"{name}_s": value for name, value in times.items()},
-        "best_central": best,
-        "best_dmpc": own,
         "dmpc_over_central": times[own] / times[best],
         "cycle_share": times[own] / net.control_step_s,
-        "agent_s": times["one"] / len(net.junctions),
-        "plan_loss": max(losses["one"], losses["pool"]),
-        "central_loss": losses[best],
+        "agent_ms": 1000 * times["one"] / len(net.junctions),
+        "plan_loss": judge.gap(stated, greens_of(plans[own]), least),
+        "central_loss": judge.gap(stated, _greens(net, problems, solutions[best]), least),
         "built_s": built_s,
-        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000,
+        "memory_mb": memory_mb,
     }
 
 

@@ -333,7 +333,7 @@ def scale_part(wanted: Wanted) -> dict[str, Any]:
         "scale": rows,
         f"dmpc_over_central_{large}": first[large]["dmpc_over_central"],
         f"cycle_share_{large}": first[large]["cycle_share"],
-        f"agent_cost_growth_{small}_{large}": first[large]["agent_s"] / first[small]["agent_s"],
+        f"agent_cost_growth_{small}_{large}": first[large]["agent_ms"] / first[small]["agent_ms"],
         f"plan_loss_{large}": first[large]["plan_loss"],
         f"memory_mb_{large}": first[large]["memory_mb"],
     }

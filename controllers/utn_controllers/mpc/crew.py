@@ -11,6 +11,8 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
+from threadpoolctl import threadpool_limits
+
 from utn_controllers.mpc.region import Region
 from utn_sumo.errors import ControllerError
 
@@ -76,6 +78,8 @@ def _received(pipe: Connection) -> Any:
 
 def _serve(pipe: Connection, build: Callable[[], Region]) -> None:
     """Build a region and answer calls to it until the other side is gone."""
+    # Two processes with as many threads as cores each would wait for one another.
+    threadpool_limits(1)
     region: Region | None = None
     method, own = "", list[Any]()
     while True:
