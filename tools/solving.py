@@ -385,7 +385,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
     for row, colour in zip(found.get("loop", [])[len(rows) :], ("C2", "0.5"), strict=False):
         axes[2].axhline(row["total_time_spent_veh_h"], color=colour, linestyle="--", label=row["coordination"])
     axes[2].set(xscale="log", ylim=(0, None), xlabel="most iterations in a step", ylabel="time spent in SUMO, veh h")
-    axes[2].set_title("closed loop, utn17, demand 1.3, mean of seeds 1-3")
+    axes[2].set_title("closed loop, demand 1.3, seeds 1-3")
     axes[2].legend()
     for axis in axes:
         axis.set_xticks((1, 2, 5, 10, 20, 40), ("1", "2", "5", "10", "20", "40"))
