@@ -48,6 +48,15 @@ def random_forecast(network: Network, rng: np.random.Generator, horizon: int) ->
     return Forecast(network.is_source * most_veh * levels(rng, horizon, len(network.links)))
 
 
+def random_greens(network: Network, rng: np.random.Generator) -> Floats:
+    """(S,) greens that fill every cycle and keep every least."""
+    green = network.min_green_s.copy()
+    for junction, budget in zip(network.junctions, network.green_budget_s, strict=True):
+        stages = list(junction.stages)
+        green[stages] += (budget - green[stages].sum()) * rng.dirichlet(np.ones(len(stages)))
+    return green
+
+
 def filled(network: Network, rng: np.random.Generator, share: Floats) -> State:
     """A state with this share (Z,) of every link's storage taken, all of it queued."""
     state, x = random_state(network, rng), share * network.storage_veh

@@ -18,16 +18,6 @@ from utn_sumo.testing import HARD, random_forecast, random_state
 HORIZON = 7
 
 
-@pytest.fixture(params=["utn17", "utn17-long"], scope="module")
-def net(request: pytest.FixtureRequest, utn17: Network, utn17_long: Network) -> Network:
-    return utn17 if request.param == "utn17" else utn17_long
-
-
-@pytest.fixture(params=["tts", "paper"], scope="module")
-def cost(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 def all_greens(plan: Plan) -> Floats:
     return np.vstack([plan.green_s, np.asarray(plan.ahead_s)])
 

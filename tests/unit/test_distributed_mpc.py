@@ -27,15 +27,10 @@ from utn_sumo import signals
 from utn_sumo.contract import EXIT, Floats, Forecast, Network, Plan, State
 from utn_sumo.errors import ControllerError, SettingError
 from utn_sumo.model import LinkModel, ModelState, StepFlows, green_windows
-from utn_sumo.testing import HARD, random_forecast, random_state
+from utn_sumo.testing import HARD, random_forecast, random_greens, random_state
 
 SEEDS = st.integers(0, 2**32 - 1)
 HORIZON = 7
-
-
-@pytest.fixture(params=["utn17", "utn17-long"], scope="module")
-def net(request: pytest.FixtureRequest, utn17: Network, utn17_long: Network) -> Network:
-    return utn17 if request.param == "utn17" else utn17_long
 
 
 def retimed(net: Network, name: str, *clocks: tuple[float, float]) -> Network:
@@ -64,11 +59,6 @@ def any_net(request: pytest.FixtureRequest, utn17: Network, utn17_long: Network,
     return {"utn17": utn17, "utn17-long": utn17_long, "mixed": mixed}[request.param]
 
 
-@pytest.fixture(params=["tts", "paper"], scope="module")
-def cost(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 def quiet_state(net: Network, x: Floats | None = None, q: Floats | None = None) -> State:
     """Nobody on the road but `x` (Z,) and, among these, the queues `q` (M,)."""
     links, turns = np.zeros(len(net.links)), np.zeros(len(net.turns))
@@ -80,14 +70,6 @@ def quiet_state(net: Network, x: Floats | None = None, q: Floats | None = None) 
 
 def some_forecast(net: Network, rng: np.random.Generator, horizon: int = HORIZON) -> Forecast:
     return random_forecast(net, rng, horizon)
-
-
-def some_greens(net: Network, rng: np.random.Generator) -> Floats:
-    green = net.min_green_s.copy()
-    for junction, budget in zip(net.junctions, net.green_budget_s, strict=True):
-        stages = list(junction.stages)
-        green[stages] += (budget - green[stages].sum()) * rng.dirichlet(np.ones(len(stages)))
-    return green
 
 
 def all_greens(plan: Plan) -> Floats:
@@ -183,7 +165,7 @@ def test_a_plan_answers_to_the_present_state_and_not_to_an_earlier_one(net: Netw
 def test_time_spent_is_never_saved_by_filling_a_link_beyond_its_storage(utn17: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
     problems = problems_of(utn17, HORIZON)
-    timing = timings(problems, Timing.of(LinkModel(utn17, utn17.control_step_s), some_greens(utn17, rng)))
+    timing = timings(problems, Timing.of(LinkModel(utn17, utn17.control_step_s), random_greens(utn17, rng)))
     _, solutions = optimum(problems, random_state(utn17, rng), some_forecast(utn17, rng), timing)
     for problem, solution in zip(problems, solutions, strict=True):
         assert solution[problem.layout.over_storage].max(initial=0) < 1e-3
@@ -287,7 +269,7 @@ def test_the_green_is_expected_where_the_last_plan_foresaw_it(utn17: Network) ->
 def test_every_problem_is_convex(any_net: Network, cost: str, seed: int) -> None:
     net, rng = any_net, np.random.default_rng(seed)
     state, forecast = random_state(net, rng), some_forecast(net, rng, 3)
-    timing = Timing.of(LinkModel(net, 60.0), some_greens(net, rng))
+    timing = Timing.of(LinkModel(net, 60.0), random_greens(net, rng))
     problems = problems_of(net, 3, cost, 60.0, control_horizon=2)
     for program in programs(problems, state, forecast, timings(problems, timing)):
         assert program.hessian == pytest.approx(program.hessian.T, abs=1e-12)
@@ -397,7 +379,7 @@ def assert_feasible_and_the_most(
 @given(seed=SEEDS)
 def test_flows_of_the_exact_model_are_feasible_and_the_most_that_may_leave(any_net: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    state, green, forecast = random_state(any_net, rng), some_greens(any_net, rng), some_forecast(any_net, rng, 1)
+    state, green, forecast = random_state(any_net, rng), random_greens(any_net, rng), some_forecast(any_net, rng, 1)
     model = LinkModel(any_net, any_net.control_step_s)
     assert_feasible_and_the_most(problems_of(any_net, 1), model, state, green, forecast)
 
@@ -409,7 +391,7 @@ def test_while_the_delay_stands_so_they_are_in_every_model_step_of_the_horizon(
     any_net: Network, step_s: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    state, green, forecast = random_state(any_net, rng), some_greens(any_net, rng), some_forecast(any_net, rng, 3)
+    state, green, forecast = random_state(any_net, rng), random_greens(any_net, rng), some_forecast(any_net, rng, 3)
     model = ConstantDelay(any_net, step_s, state)
     assert_feasible_and_the_most(problems_of(any_net, 3, step_s=step_s), model, state, green, forecast)
 
@@ -417,7 +399,7 @@ def test_while_the_delay_stands_so_they_are_in_every_model_step_of_the_horizon(
 @given(seed=SEEDS)
 def test_so_they_are_where_a_control_step_has_several_cycles_and_model_steps(motley: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    state, green, forecast = random_state(motley, rng), some_greens(motley, rng), some_forecast(motley, rng, 2)
+    state, green, forecast = random_state(motley, rng), random_greens(motley, rng), some_forecast(motley, rng, 2)
     model = ConstantDelay(motley, 120.0, state)
     assert_feasible_and_the_most(problems_of(motley, 2, step_s=120.0), model, state, green, forecast)
 
@@ -429,7 +411,7 @@ def test_the_cost_of_a_plan_is_what_the_exact_model_spends(
     any_net: Network, cost: str, horizon: int, step_s: float | None, seed: int
 ) -> None:
     net, rng = any_net, np.random.default_rng(seed)
-    state, green, forecast = random_state(net, rng), some_greens(net, rng), some_forecast(net, rng, horizon)
+    state, green, forecast = random_state(net, rng), random_greens(net, rng), some_forecast(net, rng, horizon)
     model = ConstantDelay(net, step_s or net.control_step_s, state)
     run = Run.of(model, state, green, forecast)
     x, waiting = (np.array([getattr(s, name) for s in run.states[1:]]) for name in ("x_veh", "source_queue_veh"))

@@ -20,20 +20,10 @@ from utn_sumo import signals
 from utn_sumo.contract import Floats, Forecast, Network, Plan, State
 from utn_sumo.errors import ControllerError
 from utn_sumo.model import LinkModel, ModelState, NumpyOperations, SmoothOperations, green_windows
-from utn_sumo.testing import HARD, levels, random_forecast, random_state
+from utn_sumo.testing import HARD, levels, random_forecast, random_greens, random_state
 
 HORIZON, KEPT = 7, 4
 Case = tuple[State, Forecast]
-
-
-@pytest.fixture(params=["utn17", "utn17-long"], scope="module")
-def net(request: pytest.FixtureRequest, utn17: Network, utn17_long: Network) -> Network:
-    return utn17 if request.param == "utn17" else utn17_long
-
-
-@pytest.fixture(params=["tts", "paper"], scope="module")
-def cost(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
 
 
 def settings_of(cost: str, **chosen: Any) -> ProblemSettings:
@@ -63,14 +53,6 @@ def some_case(net: Network, seed: int, horizon: int = HORIZON) -> Case:
 
 def equal_greens(net: Network, kept: int = KEPT) -> Floats:
     return np.tile(net.equal_split().green_s, (kept, 1))
-
-
-def some_greens(net: Network, rng: np.random.Generator) -> Floats:
-    green = net.min_green_s.copy()
-    for junction, budget in zip(net.junctions, net.green_budget_s, strict=True):
-        stages = list(junction.stages)
-        green[stages] += (budget - green[stages].sum()) * rng.dirichlet(np.ones(len(stages)))
-    return green
 
 
 def relaxed_greens(net: Network, settings: ProblemSettings, case: Case) -> Floats:
@@ -164,7 +146,7 @@ def test_smooth_windows_are_the_green_windows(utn17: Network, step_s: float) -> 
         symbols = ca.Function(
             "windows", [green], [each for step in steps for each in smooth_windows(model, green, step * step_s)]
         )
-        green_s = some_greens(net, rng)
+        green_s = random_greens(net, rng)
         exact, found = green_windows(net, green_s, step_s), [np.array(each).ravel() for each in symbols(green_s)]
         assert np.array(found[::2]) == pytest.approx(exact.shown_s, abs=1e-3)
         clear = exact.shown_s @ net.serves > 1.5
@@ -175,7 +157,7 @@ def test_smooth_windows_are_the_green_windows(utn17: Network, step_s: float) -> 
 def test_flows_that_begin_with_the_right_inflow_and_room_stay_right(utn17: Network, seed: int) -> None:
     rng, model = np.random.default_rng(seed), LinkModel(utn17, 120.0)
     state, forecast = some_case(utn17, seed, 1)
-    windows = green_windows(utn17, some_greens(utn17, rng), 120.0)
+    windows = green_windows(utn17, random_greens(utn17, rng), 120.0)
     start = ModelState(
         state.x_veh, state.q_veh, state.source_queue_veh, model.history(state.past_inflow_veh, utn17.sample_s)
     )

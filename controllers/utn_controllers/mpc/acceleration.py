@@ -14,7 +14,7 @@ from utn_sumo.contract import Floats
 MEMORY = 10
 """Rounds that are mixed."""
 REGULARISATION = 1e-8
-"""Of the inner products, relative to the largest: rounds that say the same must not be weighed against each other."""
+"""Relative to the sum of squares: rounds that say the same must not be weighed against each other."""
 NOTHING = 1e-100
 """Added for rounds that change nothing at all."""
 SAFEGUARD = 2.0
