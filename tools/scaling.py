@@ -13,6 +13,7 @@ import numpy as np
 import nets
 from central import Judge, central_solvers, greens_of
 from utn_controllers.mpc.distributed import DistributedMPC
+from utn_controllers.mpc.place import places
 from utn_controllers.mpc.problem import JunctionProblem
 from utn_controllers.mpc.whole import programs
 from utn_sumo.contract import Floats, Forecast, Network
@@ -39,7 +40,7 @@ def scale(kind: str, junctions: int, *, workers: int, steps: int) -> dict[str, A
     iterations, cases = [], []
     for step in range(steps):
         state, forecast = plant.state, Forecast(demand[step : step + HORIZON])
-        cases.append((state, forecast, alone.timings()))
+        cases.append((state, forecast, alone.timing()))
         plans = {}
         for name, mpc in (("one", alone), ("pool", pool)):
             begun = time.perf_counter()
@@ -51,7 +52,7 @@ def scale(kind: str, junctions: int, *, workers: int, steps: int) -> dict[str, A
     times = {name: statistics.median(each[-TIMED:]) for name, each in spent.items()}
     own = min(times, key=lambda name: times[name])
 
-    problems = [agent.problem for agent in alone.agents]
+    problems = [JunctionProblem(place, alone.settings) for place in places(net)]
     central, solutions = central_solvers(problems), {}
     for case in cases[-WARM:]:
         stated = programs(problems, *case)

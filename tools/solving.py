@@ -24,6 +24,7 @@ import numpy as np
 
 import scaling
 from central import Judge, Stopwatch, central_solvers, greens_of
+from utn_controllers.mpc.agent import Agent
 from utn_controllers.mpc.central import CentralizedMPC
 from utn_controllers.mpc.distributed import DistributedMPC
 from utn_controllers.mpc.exact import ExactProblem, rolled_out_cost
@@ -81,7 +82,7 @@ def agreement(
     for state, forecast in cases:
         mpc = mpc if warm else DistributedMPC(net, **chosen)
         judge = judge or Judge([agent.problem for agent in mpc.agents])
-        stated = programs(judge.problems, state, forecast, mpc.timings())
+        stated = programs(judge.problems, state, forecast, mpc.timing())
         plan = mpc.plan(state, forecast)
         facts.append(plan.facts)
         gaps.append(judge.gap(stated, greens_of(plan), judge.least(stated)))
@@ -118,16 +119,19 @@ def critical_path(net: Network, cases: Sequence[Case], cost: str) -> dict[str, A
     repeats. Solver times hold the update of its numbers; `_whole` ones the evaluation of the problem too.
     """
     mpcs = [DistributedMPC(net, cost=cost) for _ in range(REPEATS)]
-    watches = [[(Stopwatch(a.receding.program), Stopwatch(a.load), Stopwatch(a.solve)) for a in m.agents] for m in mpcs]
-    for mpc, watched in zip(mpcs, watches, strict=True):
-        for agent, (program, load, solve) in zip(mpc.agents, watched, strict=True):
-            agent.receding.program, agent.load, agent.solve = program, load, solve  # type: ignore[method-assign]
-    problems = [agent.problem for agent in mpcs[0].agents]
+    alone = [[agent for agent in mpc.agents if isinstance(agent, Agent)] for mpc in mpcs]
+    watches = [
+        [(Stopwatch(a.receding.programs), Stopwatch(a.load), Stopwatch(a.solve)) for a in agents] for agents in alone
+    ]
+    for agents, watched in zip(alone, watches, strict=True):
+        for agent, (program, load, solve) in zip(agents, watched, strict=True):
+            agent.receding.programs, agent.load, agent.solve = program, load, solve  # type: ignore[method-assign]
+    problems = [agent.problem for agent in alone[0]]
     central = central_solvers(problems)
     evaluate = Stopwatch(programs)
     rows = []
     for state, forecast in cases:
-        stated = evaluate(problems, state, forecast, mpcs[0].timings())
+        stated = evaluate(problems, state, forecast, mpcs[0].timing())
         repeats = []
         for mpc, watched in zip(mpcs, watches, strict=True):
             for watch in (watch for each in watched for watch in each):

@@ -255,41 +255,47 @@ class Network:
         """Length of a sample, in which the entry loops are counted."""
         return self.control_step_s / self.samples
 
-    def part(self, junction: int) -> Network:
-        """The network of one junction alone: its incoming links, their turns, its stages.
+    def part(self, *junctions: int) -> Network:
+        """The network of some junctions alone, one's incoming links, turns and stages after the other's.
 
         Indices count within the part; a turn that leads to another junction ends in EXIT.
         """
-        links, turns = self.links_of[junction].tolist(), self.turns_of[junction].tolist()
-        place = {link: position for position, link in enumerate(links)}
-        turn_place = {turn: position for position, turn in enumerate(turns)}
-        whole = self.junctions[junction]
+        links = np.concatenate([self.links_of[junction] for junction in junctions]).tolist()
+        turns = np.concatenate([self.turns_of[junction] for junction in junctions]).tolist()
+        stages = [stage for junction in junctions for stage in self.junctions[junction].stages]
+        link_place, turn_place, stage_place, junction_place = (
+            {whole: position for position, whole in enumerate(each)} for each in (links, turns, stages, junctions)
+        )
+
+        def ahead(turn: Turn) -> int:
+            own = turn.next_link != EXIT and self.links[turn.next_link].junction == self.links[turn.link].junction
+            return link_place[turn.next_link] if own else EXIT
+
         return Network(
-            name=f"{self.name}:{whole.id}",
+            name=f"{self.name}:{self.junctions[junctions[0]].id}" + "+" * (len(junctions) > 1),
             net_file=self.net_file,
-            links=tuple(replace(self.links[link], junction=0) for link in links),
+            links=tuple(
+                replace(self.links[link], junction=junction_place[self.links[link].junction]) for link in links
+            ),
             turns=tuple(
-                replace(
-                    self.turns[turn],
-                    link=place[self.turns[turn].link],
-                    next_link=place.get(self.turns[turn].next_link, EXIT),
-                )
-                for turn in turns
+                replace(turn, link=link_place[turn.link], next_link=ahead(turn))
+                for turn in (self.turns[index] for index in turns)
             ),
             stages=tuple(
                 replace(
-                    self.stages[stage],
-                    junction=0,
-                    turns=tuple(turn_place[turn] for turn in self.stages[stage].turns),
+                    stage,
+                    junction=junction_place[stage.junction],
+                    turns=tuple(turn_place[turn] for turn in stage.turns),
                 )
-                for stage in whole.stages
+                for stage in (self.stages[index] for index in stages)
             ),
-            junctions=(
+            junctions=tuple(
                 replace(
                     whole,
-                    stages=tuple(range(len(whole.stages))),
+                    stages=tuple(stage_place[stage] for stage in whole.stages),
                     signal_turn=tuple(turn_place.get(turn, -1) for turn in whole.signal_turn),
-                ),
+                )
+                for whole in (self.junctions[index] for index in junctions)
             ),
             edge_lanes=self.edge_lanes,
             edge_length_m=self.edge_length_m,

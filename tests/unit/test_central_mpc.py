@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from utn_controllers.mpc.central import CentralizedMPC, Convex
 from utn_controllers.mpc.distributed import DistributedMPC
-from utn_controllers.mpc.problem import STORAGE_PENALTY
+from utn_controllers.mpc.problem import Timing
+from utn_controllers.mpc.receding import RecedingProblem
+from utn_controllers.mpc.statement import STORAGE_PENALTY
 from utn_controllers.mpc.whole import optimum, programs
 from utn_sumo import signals
 from utn_sumo.contract import Floats, Network, Plan
@@ -16,6 +20,11 @@ from utn_sumo.errors import SettingError
 from utn_sumo.testing import HARD, random_forecast, random_state
 
 HORIZON = 7
+
+
+def joined(receding: Sequence[RecedingProblem]) -> Timing:
+    """What all of them are frozen at."""
+    return Timing.joined([each.timing() for each in receding], [each.place for each in receding])
 
 
 def all_greens(plan: Plan) -> Floats:
@@ -34,7 +43,7 @@ def test_plans_in_the_loop_are_the_optimum_from_scratch(net: Network, cost: str)
     for seed in range(4):
         rng = np.random.default_rng(seed)
         state, forecast = random_state(net, rng), random_forecast(net, rng, HORIZON)
-        best, _ = optimum(problems, state, forecast, [each.timing() for each in receding])
+        best, _ = optimum(problems, state, forecast, joined(receding))
         plan = mpc.plan(state, forecast)
         assert plan.facts["cost"] == pytest.approx(best, rel=1e-6)
         for green_s in all_greens(plan):
@@ -46,10 +55,10 @@ def test_no_agents_do_better_and_many_iterations_do_as_well(net: Network, cost: 
     state, forecast = random_state(net, rng), random_forecast(net, rng, HORIZON)
     central = CentralizedMPC(net, cost=cost, tolerance=1e-8)
     receding = planner(central).receding
-    problems, timings = [each.problem for each in receding], [each.timing() for each in receding]
+    problems, timing = [each.problem for each in receding], joined(receding)
     best = central.plan(state, forecast).facts["cost"]
     patient = DistributedMPC(net, cost=cost, iterations=400, tolerance_abs=1e-5, tolerance_rel=1e-6)
-    reached, _ = optimum(problems, state, forecast, timings, all_greens(patient.plan(state, forecast)))
+    reached, _ = optimum(problems, state, forecast, timing, all_greens(patient.plan(state, forecast)))
     assert -1e-7 <= reached / best - 1 < 1e-4
 
 
@@ -58,7 +67,7 @@ def test_solutions_agree_on_every_flow_between_junctions(utn17: Network, cost: s
     state, forecast = random_state(utn17, rng), random_forecast(utn17, rng, HORIZON)
     convex = planner(CentralizedMPC(utn17, cost=cost))
     problems = [each.problem for each in convex.receding]
-    stated = programs(problems, state, forecast, [each.timing() for each in convex.receding])
+    stated = programs(problems, state, forecast, joined(convex.receding))
     found, solutions = convex.whole.solve(stated)
     total = sum(program.cost(solution) for program, solution in zip(stated, solutions, strict=True))
     assert found == pytest.approx(total, rel=1e-6)
@@ -94,7 +103,7 @@ def test_who_pays_for_storage_stays_within_it(utn17: Network) -> None:
     state, forecast = HARD["flood"](utn17, np.random.default_rng(1), HORIZON)
     convex = planner(CentralizedMPC(utn17, tolerance=1e-8))
     problems = [each.problem for each in convex.receding]
-    _, solutions = convex.whole.solve(programs(problems, state, forecast, [each.timing() for each in convex.receding]))
+    _, solutions = convex.whole.solve(programs(problems, state, forecast, joined(convex.receding)))
     for problem, solution in zip(problems, solutions, strict=True):
         assert solution[problem.layout.over_storage].max(initial=0) < 1e-3
 

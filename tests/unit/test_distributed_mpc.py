@@ -14,14 +14,9 @@ from hypothesis import settings as limits
 from hypothesis import strategies as st
 
 from utn_controllers.mpc.distributed import DistributedMPC, Settings
-from utn_controllers.mpc.problem import (
-    REGULARISATION,
-    JunctionProblem,
-    QuadraticProgram,
-    Timing,
-    places,
-    remaining_steps,
-)
+from utn_controllers.mpc.place import places, remaining_steps
+from utn_controllers.mpc.problem import JunctionProblem, QuadraticProgram, Timing
+from utn_controllers.mpc.statement import REGULARISATION
 from utn_controllers.mpc.whole import optimum, programs
 from utn_sumo import signals
 from utn_sumo.contract import EXIT, Floats, Forecast, Network, Plan, State
@@ -133,7 +128,7 @@ def patient(net: Network, **chosen: Any) -> DistributedMPC:
 
 def gap_to_the_optimum(mpc: DistributedMPC, state: State, forecast: Forecast) -> float:
     """How much dearer the next plan is than the best one, as a share."""
-    problems, timing = [agent.problem for agent in mpc.agents], mpc.timings()
+    problems, timing = [agent.problem for agent in mpc.agents], mpc.timing()
     best, _ = optimum(problems, state, forecast, timing)
     reached, _ = optimum(problems, state, forecast, timing, all_greens(mpc.plan(state, forecast)))
     return (reached - best) / abs(best)
@@ -165,7 +160,7 @@ def test_a_plan_answers_to_the_present_state_and_not_to_an_earlier_one(net: Netw
 def test_time_spent_is_never_saved_by_filling_a_link_beyond_its_storage(utn17: Network, seed: int) -> None:
     rng = np.random.default_rng(seed)
     problems = problems_of(utn17, HORIZON)
-    timing = timings(problems, Timing.of(LinkModel(utn17, utn17.control_step_s), random_greens(utn17, rng)))
+    timing = Timing.of(LinkModel(utn17, utn17.control_step_s), random_greens(utn17, rng))
     _, solutions = optimum(problems, random_state(utn17, rng), some_forecast(utn17, rng), timing)
     for problem, solution in zip(problems, solutions, strict=True):
         assert solution[problem.layout.over_storage].max(initial=0) < 1e-3
@@ -175,7 +170,7 @@ def test_a_better_plan_than_the_equal_split_is_found(utn17: Network) -> None:
     rng = np.random.default_rng(3)
     state, forecast = random_state(utn17, rng), some_forecast(utn17, rng)
     mpc = DistributedMPC(utn17)
-    problems, timing = [agent.problem for agent in mpc.agents], mpc.timings()
+    problems, timing = [agent.problem for agent in mpc.agents], mpc.timing()
     greens, equal = all_greens(mpc.plan(state, forecast)), np.tile(utn17.equal_split().green_s, (4, 1))
     found, split = (optimum(problems, state, forecast, timing, plan)[0] for plan in (greens, equal))
     assert found < split
@@ -239,7 +234,7 @@ def test_who_reaches_the_queue_after_its_green_leaves_a_step_later(utn17: Networ
     demand[0] = 24.0 * utn17.is_source
     mpc = DistributedMPC(utn17, horizon=3)
     problems, timing = [agent.problem for agent in mpc.agents], Timing.of(LinkModel(utn17, 120.0), equal_s(utn17))
-    _, solutions = optimum(problems, quiet_state(utn17), Forecast(demand), timings(problems, timing))
+    _, solutions = optimum(problems, quiet_state(utn17), Forecast(demand), timing)
     # One vehicle every five seconds, each as long on the way as the free road takes.
     in_time = (np.maximum(timing.end_s[0] - utn17.free_time_s[utn17.turn_link], 0) / 5) * utn17.fraction
     for problem, solution in zip(problems, solutions, strict=True):
@@ -256,8 +251,8 @@ def test_the_green_is_expected_where_the_last_plan_foresaw_it(utn17: Network) ->
     foreseen = utn17.equal_split().green_s
     for _ in range(3):
         whole = Timing.of(model, foreseen)
-        for agent, timing in zip(mpc.agents, mpc.timings(), strict=True):
-            expected = whole.part(agent.place)
+        for agent in mpc.agents:
+            timing, expected = mpc.timing().part(agent.place), whole.part(agent.place)
             assert timing.shown == pytest.approx(expected.shown)
             assert timing.end_s == pytest.approx(expected.end_s)
             assert timing.opening == pytest.approx(expected.opening)
@@ -271,15 +266,10 @@ def test_every_problem_is_convex(any_net: Network, cost: str, seed: int) -> None
     state, forecast = random_state(net, rng), some_forecast(net, rng, 3)
     timing = Timing.of(LinkModel(net, 60.0), random_greens(net, rng))
     problems = problems_of(net, 3, cost, 60.0, control_horizon=2)
-    for program in programs(problems, state, forecast, timings(problems, timing)):
+    for program in programs(problems, state, forecast, timing):
         assert program.hessian == pytest.approx(program.hessian.T, abs=1e-12)
         assert np.linalg.eigvalsh(program.hessian).min() > -1e-9
         assert (program.lower <= program.upper).all()
-
-
-def timings(problems: list[JunctionProblem], timing: Timing) -> list[Timing]:
-    """The whole network's timing, cut for each junction."""
-    return [timing.part(problem.place) for problem in problems]
 
 
 def equal_s(net: Network) -> Floats:
@@ -358,8 +348,7 @@ def assert_feasible_and_the_most(
     """The model's flows are feasible, and neither more could leave the network nor more come in than there is room."""
     net, timing, run = model.network, Timing.of(model, green), Run.of(model, state, green, forecast)
     shown = green_windows(net, green, model.step_s).shown_s
-    frozen = timings(problems, timing)
-    for problem, program in zip(problems, programs(problems, state, forecast, frozen), strict=True):
+    for problem, program in zip(problems, programs(problems, state, forecast, timing), strict=True):
         z = decision(problem, green, run)
         assert excess(program, z) < 1e-6
         for step, (before, flows) in enumerate(zip(run.states, run.flows, strict=False)):
@@ -426,7 +415,7 @@ def test_the_cost_of_a_plan_is_what_the_exact_model_spends(
     found: Any = 0.0
     timing = Timing.of(model, green)
     problems = problems_of(net, horizon, cost, step_s)
-    for problem, program in zip(problems, programs(problems, state, forecast, timings(problems, timing)), strict=True):
+    for problem, program in zip(problems, programs(problems, state, forecast, timing), strict=True):
         z = decision(problem, green, run)
         found += program.cost(z)
     assert found == pytest.approx(expected, rel=1e-9)
@@ -441,7 +430,7 @@ def test_no_model_step_lets_out_more_than_green_all_through_it_would(utn17: Netw
     problems = problems_of(utn17, 2, step_s=step_s)
     timing = Timing.of(LinkModel(utn17, step_s), utn17.equal_split().green_s)
     state = quiet_state(utn17, q=q)
-    _, solutions = optimum(problems, state, Forecast(np.zeros((2, 17))), timings(problems, timing))
+    _, solutions = optimum(problems, state, Forecast(np.zeros((2, 17))), timing)
     problem, solution = problems[utn17.links[link].junction], solutions[utn17.links[link].junction]
     leaving = solution[problem.layout.leaving][:, utn17.turn_link[problem.place.turns] == link].sum(axis=1)
     assert leaving.max() <= utn17.saturation_flow_veh_s[link] * step_s + 1e-3

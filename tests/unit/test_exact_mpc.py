@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from utn_controllers.mpc.exact import OPTIONS, ExactProblem, ExactSolution, rolled_out_cost, smooth_windows
-from utn_controllers.mpc.problem import JunctionProblem, Timing, places
+from utn_controllers.mpc.place import places
+from utn_controllers.mpc.problem import JunctionProblem, Timing
 from utn_controllers.mpc.settings import ProblemSettings
 from utn_controllers.mpc.whole import optimum
 from utn_sumo import signals
@@ -59,7 +60,7 @@ def relaxed_greens(net: Network, settings: ProblemSettings, case: Case) -> Float
     """Greens (Kc, S) of the convex problem frozen at the equal split."""
     problems = [JunctionProblem(place, settings) for place in places(net)]
     timing = Timing.of(LinkModel(net, net.control_step_s), net.equal_split().green_s)
-    _, solutions = optimum(problems, *case, [timing.part(each.place) for each in problems])
+    _, solutions = optimum(problems, *case, timing)
     greens = np.zeros((KEPT, len(net.stages)))
     for each, solution in zip(problems, solutions, strict=True):
         greens[:, each.place.stages] = each.greens(solution)

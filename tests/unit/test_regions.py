@@ -10,7 +10,7 @@ import pytest
 
 from utn_controllers.mpc.crew import Processes
 from utn_controllers.mpc.distributed import DistributedMPC
-from utn_controllers.mpc.problem import places
+from utn_controllers.mpc.place import places
 from utn_controllers.mpc.region import SUMS, Message, Region
 from utn_controllers.mpc.settings import Settings
 from utn_sumo.contract import EXIT, Forecast, Network, State

@@ -1,4 +1,4 @@
-"""One agent: a junction's problem, its solver, and the flows that it shares with its neighbours."""
+"""One agent: a junction's problem and its solver, for whatever its neighbours say of the flows that it shares."""
 
 from __future__ import annotations
 
@@ -6,44 +6,49 @@ from typing import Any
 
 import numpy as np
 
-from utn_controllers.mpc.problem import Place, QuadraticProgram
+from utn_controllers.mpc.problem import QuadraticProgram
 from utn_controllers.mpc.receding import RecedingProblem
-from utn_controllers.mpc.settings import ProblemSettings
-from utn_sumo.contract import Floats, Forecast, State
+from utn_sumo.contract import Floats, Forecast, Ints, State
 from utn_sumo.errors import ControllerError
 
 EQUALITY = 5
 """DAQP's code for an equality row."""
 OPTIMAL = (1, 2)
 """DAQP's exit flags of an optimum: 1, and 2 with a soft constraint in use."""
+NOWHERE = -1
+"""Of a variable that is no part of any shared flow."""
+
+
+def gram(shared: Ints) -> Floats:
+    """(n, n) curvature of the sum of |shared flow|^2 / 2, a shared flow being the sum of the variables that name it."""
+    return np.asarray((shared[:, None] == shared) & (shared != NOWHERE), dtype=float)
 
 
 class Agent:
     """Solves  min phi + sum over its shared flows y [l'y + rho/2 |y|^2]  again and again, for other l (SPEC 4).
 
-    The shared flows are its copies of the inflow of the links that neighbours feed, then its outflows to the links
-    that it feeds. An agent whose inflow is `given` does not choose the former: they are set from outside.
+    Shared are its copies of the inflow of the links that neighbours feed, and its outflows to the links that it feeds.
+    An agent whose inflow is `given` does not choose the former: they are set from outside.
     """
 
-    def __init__(self, place: Place, settings: ProblemSettings, *, given: bool):
+    def __init__(self, receding: RecedingProblem, shared: Ints, *, given: bool):
+        """`shared` (1, n) names, for each variable, the shared flow that it is part of, or `NOWHERE`."""
         import daqp  # noqa: PLC0415 - compiled, loaded at use
 
         self._new_solver = daqp.Model
-        self.receding = RecedingProblem(place, settings)
-        self.problem = self.receding.problem
-        self.place = place
-        problem, consumed, produced = self.problem, place.consumed, place.produced
-        blocks = [problem.inflow_rows(link) for link in consumed] + [problem.outflow_rows(link) for link in produced]
-        self._coupling = np.vstack(blocks) if blocks else np.zeros((0, problem.layout.size))
-        self._taken = len(consumed) * problem.steps
-        """How many of the shared numbers are inflows."""
-        self._given = given
-        chosen = self._coupling[self._taken :] if given else self._coupling
-        self._gram = chosen.T @ chosen
-        self._inflow = self._coupling[: self._taken].argmax(axis=1)
-        self._shape = (len(consumed) + len(produced), problem.steps)
+        self.receding = receding
+        self.problem = receding.problem
+        self.place = receding.place
+        self.shared = shared[0]
+        inflow = self.problem.layout.inflow.ravel()
+        self._given = inflow[self.shared[inflow] != NOWHERE] if given else inflow[:0]
+        chosen = self.shared.copy()
+        chosen[self._given] = NOWHERE
+        self._gram = gram(chosen)
         self.program: QuadraticProgram | None = None
-        self.solution: Floats = np.zeros(problem.layout.size)
+        self.solution: Floats = np.zeros(self.problem.layout.size)
+        self.residual = 0.0
+        """Sum of squares by which the solution breaks its rows [veh^2]: none, the solver is exact."""
         self._solver: Any = None
         self._rho = 0.0
 
@@ -51,7 +56,7 @@ class Agent:
         """Take up a new state. The Hessian is factorised once for each `rho`; later states only bring vectors
         and the constraint matrix, and the solver starts from the last active set.
         """
-        self.program = self.receding.program(state, forecast)
+        self.program = self.receding.programs(state, forecast).only
         self.load(rho)
 
     def load(self, rho: float) -> None:
@@ -67,8 +72,7 @@ class Agent:
         program = self._program()
         sense = np.zeros(len(program.upper), dtype=np.int32)
         sense[program.lower == program.upper] = EQUALITY
-        if self._given:
-            sense[self._inflow] = EQUALITY
+        sense[self._given] = EQUALITY
         self._rho = rho
         self._solver = self._new_solver()
         flag, _ = self._solver.setup(
@@ -83,20 +87,19 @@ class Agent:
         return self.program
 
     def solve(self, linear: Floats) -> Floats:
-        """Best answer to the linear terms `linear` (n, model steps) of the shared flows; the flows (n, model steps).
+        """Best answer (n,) to the linear terms `linear` (n,) that each variable has of the flow that it is part of.
 
-        With `given` inflows `linear` holds their values [veh] in their places, and the answer what one vehicle more in
-        them costs the agent: the multipliers, mu of SPEC 4.
+        For `given` inflows `linear` holds their values [veh], and the answer what one vehicle more in them costs
+        the agent: the multipliers, mu of SPEC 4.
         """
-        terms = linear.ravel()
+        program, given = self._program(), self._given
+        gradient = program.gradient + linear
         bounds = {}
-        if self._given:
-            upper, lower = self._program().upper.copy(), self._program().lower.copy()
-            upper[self._inflow] = lower[self._inflow] = terms[: self._taken]
+        if len(given):
+            gradient[given] = program.gradient[given]
+            upper, lower = program.upper.copy(), program.lower.copy()
+            upper[given] = lower[given] = linear[given]
             bounds = {"bupper": upper, "blower": lower}
-            gradient = self._program().gradient + self._coupling[self._taken :].T @ terms[self._taken :]
-        else:
-            gradient = self._program().gradient + self._coupling.T @ terms
         self._solver.update(f=gradient, **bounds)
         solution, _, flag, info = self._solver.solve()
         if flag not in OPTIMAL:
@@ -107,7 +110,12 @@ class Agent:
         if flag not in OPTIMAL or not np.isfinite(solution).all():
             raise ControllerError(f"agent {self.place.part.name}: no optimum (flag {flag})")
         self.solution = solution
-        shared = self._coupling @ solution
-        if self._given:
-            shared[: self._taken] = -info["lam"][self._inflow]
-        return np.asarray(shared).reshape(self._shape)
+        if not len(given):
+            return np.asarray(solution)
+        answer = solution.copy()
+        answer[given] = -info["lam"][given]
+        return np.asarray(answer)
+
+    def settle(self) -> Floats:
+        """(Kc, S) greens of the last solution, from which the next step's problem starts."""
+        return self.receding.settle(self.solution)

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from utn_controllers.mpc.exact import ExactProblem
-from utn_controllers.mpc.problem import places
+from utn_controllers.mpc.place import places
 from utn_controllers.mpc.receding import RecedingProblem
 from utn_controllers.mpc.settings import ProblemSettings
 from utn_controllers.mpc.whole import WholeProblem
@@ -69,7 +69,7 @@ class Convex:
 
     def plan(self, state: State, forecast: Forecast) -> tuple[Floats, dict[str, Any]]:
         programs = [
-            each.program(state.part(each.place.links, each.place.turns), forecast.part(each.place.links))
+            each.programs(state.part(each.place.links, each.place.turns), forecast.part(each.place.links)).only
             for each in self.receding
         ]
         cost, solutions = self.whole.solve(programs)

@@ -3,20 +3,41 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from utn_controllers.mpc.agent import Agent
 from utn_controllers.mpc.coordination import Coordinator
 from utn_controllers.mpc.crew import Crew, DaskActors, InProcess, Processes
-from utn_controllers.mpc.problem import Timing, places
+from utn_controllers.mpc.place import places
+from utn_controllers.mpc.problem import Timing
 from utn_controllers.mpc.region import Region
 from utn_controllers.mpc.settings import Settings
+from utn_controllers.mpc.statement import Structure
 from utn_sumo.contract import Forecast, Network, Plan, State
 from utn_sumo.model import check_step
 
+if TYPE_CHECKING:
+    from utn_controllers.mpc.agent import Agent
+    from utn_controllers.mpc.batch import Batch
+
 __all__ = ["DistributedMPC", "Settings"]
+
+
+BATCH_FROM = 8
+"""Junctions of one structure that are better solved side by side than one by one."""
+
+
+def _alike(network: Network, junctions: list[int], settings: Settings) -> list[list[int]]:
+    """The junctions in groups of one structure where enough of them have it, else alone."""
+    if settings.coordination != "admm":
+        return [[junction] for junction in junctions]
+    alike: dict[Structure, list[int]] = {}
+    for junction in junctions:
+        alike.setdefault(Structure.of(network.part(junction), settings), []).append(junction)
+    large = [group for group in alike.values() if len(group) >= BATCH_FROM]
+    few = sorted(junction for group in alike.values() if len(group) < BATCH_FROM for junction in group)
+    return [[junction] for junction in few] + large
 
 
 class DistributedMPC:
@@ -29,9 +50,12 @@ class DistributedMPC:
         self.horizon = self.settings.horizon
         self.network = network
         check_step(network, self.settings.step_s or network.control_step_s)
-        self.places = places(network)
-        shared = np.array_split(np.arange(len(self.places)), min(self.settings.workers, len(self.places)))
-        self._groups = [[self.places[junction] for junction in group] for group in shared]
+        count = len(network.junctions)
+        shared = np.array_split(np.arange(count), min(self.settings.workers, count))
+        parted = [_alike(network, junctions.tolist(), self.settings) for junctions in shared]
+        found = iter(places(network, [group for groups in parted for group in groups]))
+        self._groups = [[next(found) for _ in groups] for groups in parted]
+        """Places of each region."""
         self._shares = [
             tuple(np.concatenate([getattr(place, name) for place in group]) for name in ("links", "turns", "stages"))
             for group in self._groups
@@ -41,14 +65,14 @@ class DistributedMPC:
         self._coordinator = Coordinator(self.crew, self.settings)
 
     @property
-    def agents(self) -> list[Agent]:
-        """The agents of this process, by junction."""
+    def agents(self) -> list[Agent | Batch]:
+        """The agents of this process."""
         assert isinstance(self.crew, InProcess)
         return [agent for region in self.crew.regions for agent in region.agents]
 
-    def timings(self) -> list[Timing]:
-        """What the next plan's problems are frozen at, by junction."""
-        return [agent.receding.timing() for agent in self.agents]
+    def timing(self) -> Timing:
+        """What the next plan's problems are frozen at, the whole network's; of agents of this process."""
+        return Timing.joined([each.receding.timing() for each in self.agents], [each.place for each in self.agents])
 
     def plan(self, state: State, forecast: Forecast) -> Plan:
         """Coordinated greens for the coming cycle and the control horizon; ControllerError without an optimum."""
@@ -61,11 +85,11 @@ class DistributedMPC:
 
     def _crew(self) -> Crew:
         """Neighbouring junctions in one region as far as their order tells; who feeds whom across the borders."""
-        home = {place.part.name: region for region, group in enumerate(self._groups) for place in group}
         ends: dict[int, list[int]] = {}
-        for place in self.places:
-            for link in (*place.consumed, *place.produced):
-                ends.setdefault(link, []).append(home[place.part.name])
+        for region, group in enumerate(self._groups):
+            for place in group:
+                for link in (*place.consumed, *place.produced):
+                    ends.setdefault(link, []).append(region)
         builders = []
         for region, group in enumerate(self._groups):
             partners = {

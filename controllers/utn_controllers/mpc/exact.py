@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from utn_controllers.mpc.problem import remaining_steps
+from utn_controllers.mpc.place import remaining_steps
 from utn_controllers.mpc.settings import ProblemSettings
 from utn_sumo.contract import Floats, Forecast, Network, State
 from utn_sumo.errors import ControllerError

@@ -1,10 +1,14 @@
-"""A junction's problem from step to step: what the last plan foresaw is what the next problem is frozen at."""
+"""The problem of a junction, or of several alike, from step to step.
+
+What the last plan foresaw is what the next problem is frozen at.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.mpc.problem import JunctionProblem, Place, QuadraticProgram, Timing
+from utn_controllers.mpc.place import Place
+from utn_controllers.mpc.problem import JunctionProblem, Programs, Timing
 from utn_controllers.mpc.settings import ProblemSettings
 from utn_sumo.contract import Floats, Forecast, State
 
@@ -28,13 +32,13 @@ class RecedingProblem:
         """What the next programme is frozen at."""
         return Timing.of(self.problem.model, np.maximum(self._expected_s, LEAST_EXPECTED_S), self._delay_s)
 
-    def program(self, state: State, forecast: Forecast) -> QuadraticProgram:
-        """The programme of the junction's own state, for the coming steps."""
+    def programs(self, state: State, forecast: Forecast) -> Programs:
+        """The programmes of the junctions' own state, for the coming steps."""
         self._state = state
-        return self.problem.program(state, forecast, self.timing())
+        return self.problem.programs(state, forecast, self.timing())
 
     def settle(self, solution: Floats) -> Floats:
-        """(Kc, S) greens of the last programme's solution, which the next one is then frozen at."""
+        """(Kc, S) greens of the last programmes' solution (junctions, n), which the next ones are then frozen at."""
         assert self._state is not None
         greens = self.problem.greens(solution)
         self._expected_s = greens[min(1, len(greens) - 1)]

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from utn_controllers.mpc.problem import JunctionProblem, Pattern, QuadraticProgram, Timing
+from utn_controllers.mpc.problem import JunctionProblem, QuadraticProgram, Timing
+from utn_controllers.mpc.statement import Pattern
 from utn_sumo.contract import EXIT, Floats, Forecast, Ints, State
 from utn_sumo.errors import ControllerError
 
@@ -117,14 +118,12 @@ class WholeProblem:
 
 
 def programs(
-    problems: Sequence[JunctionProblem], state: State, forecast: Forecast, timings: Sequence[Timing]
+    problems: Sequence[JunctionProblem], state: State, forecast: Forecast, timing: Timing
 ) -> list[QuadraticProgram]:
-    """Every junction's programme, of the whole network's state."""
+    """Every junction's programme, of the whole network's state and timing."""
     return [
-        problem.program(
-            state.part(problem.place.links, problem.place.turns), forecast.part(problem.place.links), timing
-        )
-        for problem, timing in zip(problems, timings, strict=True)
+        problem.program(state.part(place.links, place.turns), forecast.part(place.links), timing.part(place))
+        for problem, place in ((problem, problem.place) for problem in problems)
     ]
 
 
@@ -132,7 +131,7 @@ def optimum(
     problems: Sequence[JunctionProblem],
     state: State,
     forecast: Forecast,
-    timings: Sequence[Timing],
+    timing: Timing,
     greens: Floats | None = None,
 ) -> tuple[float, list[Floats]]:
     """Least cost of the whole network and each junction's solution, from scratch.
@@ -141,7 +140,7 @@ def optimum(
     are the best possible ones. Raises ControllerError if the solver finds no optimum.
     """
     whole = WholeProblem(problems, fixed_greens=greens is not None)
-    return whole.solve(programs(problems, state, forecast, timings), greens)
+    return whole.solve(programs(problems, state, forecast, timing), greens)
 
 
 def _rows_below(pattern: Pattern, budgets: int) -> Any:

@@ -1,0 +1,70 @@
+"""A junction's place in the network: itself, and the little that it has to know of what is round it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import spsolve
+
+from utn_sumo.contract import EXIT, Floats, Ints, Network
+
+
+@dataclass(frozen=True)
+class Place:
+    """A junction and what it has to know of the network round it: nothing else reaches its problem.
+
+    Several junctions may share a place, one's links, turns and stages after the other's.
+    """
+
+    part: Network
+    links: Ints
+    """(n,) its links' numbers in the whole network."""
+    turns: Ints
+    stages: Ints
+    turn_next: Ints
+    """(M,) link of the whole network that each of its turns feeds, or EXIT."""
+    remaining_steps: Floats
+    """(n,) control steps that a vehicle on each link still needs to leave the network."""
+
+    @property
+    def consumed(self) -> list[int]:
+        """Links of this junction that a neighbour feeds."""
+        return [int(link) for link in self.links[~self.part.is_source]]
+
+    @property
+    def produced(self) -> list[int]:
+        """Links that this junction feeds."""
+        return sorted(set(self.turn_next[self.turn_next != EXIT].tolist()))
+
+
+def places(network: Network, groups: Iterable[Sequence[int]] | None = None) -> list[Place]:
+    """The places of groups of junctions, or else of every junction alone."""
+    remaining = remaining_steps(network)
+    found = []
+    for group in groups or [[junction] for junction in range(len(network.junctions))]:
+        links, turns, stages = (
+            np.concatenate([np.asarray(each, dtype=np.int64) for each in own])
+            for own in (
+                [network.links_of[junction] for junction in group],
+                [network.turns_of[junction] for junction in group],
+                [network.junctions[junction].stages for junction in group],
+            )
+        )
+        part = network.part(*group)
+        found.append(Place(part, links, turns, stages, network.turn_next[turns], remaining[links]))
+    return found
+
+
+def remaining_steps(network: Network) -> Floats:
+    """(Z,) control steps that a vehicle on each link still needs to leave the network.
+
+    Free travel and half a cycle's wait on each link of its expected way, summed by the turning fractions.
+    """
+    own = (network.free_time_s + network.cycle_s[network.link_junction] / 2) / network.control_step_s
+    fed = np.flatnonzero(network.turn_next != EXIT)
+    size = len(network.links)
+    onward = sp.csc_array((network.fraction[fed], (network.turn_link[fed], network.turn_next[fed])), shape=(size, size))
+    return np.asarray(spsolve(sp.csc_array(sp.eye_array(size)) - onward, own), dtype=float)
