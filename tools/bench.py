@@ -93,7 +93,7 @@ def overhead(net: str, hours: float, demand: float, seed: int, repeats: int, as_
 @click.option("--states", default=50, show_default=True, help="Random states for the gaps.")
 @click.option("--hard", default=1000, show_default=True, help="Hard states for the failures.")
 @click.option("--sizes", default="100,400,1000", show_default=True, help="Junctions of the large networks.")
-@click.option("--grids", default="one-way", show_default=True, help="Kinds: one-way, imported (hours, centrally).")
+@click.option("--grids", default="one-way", show_default=True, help="Kinds: one-way, imported (half an hour).")
 @click.option("--steps", default=14, show_default=True, help="Control steps on them.")
 @click.option("--hours", default=4.0, show_default=True, help="Of the run for the overhead.")
 @click.option("--plot", type=click.Path(path_type=Path), help="Draw gaps and time spent against the iterations here.")

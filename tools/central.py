@@ -108,6 +108,5 @@ class Osqp:
         return self._solver.solve()
 
 
-def central_solvers(problems: Sequence[JunctionProblem]) -> dict[str, Central]:
-    """Those that were found fastest (Clarabel and HiGHS take twice as long and more)."""
-    return {"piqp": Piqp(problems), "osqp": Osqp(problems)}
+SOLVERS: dict[str, Callable[[Sequence[JunctionProblem]], Central]] = {"piqp": Piqp, "osqp": Osqp}
+"""Those that were found fastest (Clarabel and HiGHS take twice as long and more)."""

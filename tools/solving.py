@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import scaling
-from central import Judge, Stopwatch, central_solvers, greens_of
+from central import SOLVERS, Judge, Stopwatch, greens_of
 from utn_controllers.mpc.agent import Agent
 from utn_controllers.mpc.central import CentralizedMPC
 from utn_controllers.mpc.distributed import DistributedMPC
@@ -127,7 +127,7 @@ def critical_path(net: Network, cases: Sequence[Case], cost: str) -> dict[str, A
         for agent, (program, load, solve) in zip(agents, watched, strict=True):
             agent.receding.programs, agent.load, agent.solve = program, load, solve  # type: ignore[method-assign]
     problems = [agent.problem for agent in alone[0]]
-    central = central_solvers(problems)
+    central = {name: build(problems) for name, build in SOLVERS.items()}
     evaluate = Stopwatch(programs)
     rows = []
     for state, forecast in cases:
