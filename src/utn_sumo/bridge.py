@@ -55,6 +55,7 @@ def run(
         scale=scenario.demand,
         noise=scenario.noise,
         seed=scenario.seed,
+        disturbance_veh_h=scenario.disturbance,
     )
     folder = recording.new_folder(folder, _default_name(scenario))
     routes = folder / "routes.rou.xml"
@@ -62,7 +63,8 @@ def run(
     shutil.copyfile(net.net_file, folder / "net.net.xml")
     profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
     predictor = ProfileForecast(profile_veh_h * step_s / 3600)
-    estimator = Estimator(net, known, scenario.loop_error)
+    disturbance_veh = scenario.disturbance * scenario.demand * step_s / 3600
+    estimator = Estimator(net, known, scenario.loop_error, disturbance_veh)
     miscount = Miscount(net, scenario.loop_error, scenario.seed)
     supervisor = Supervisor(net, controller)
     tally = _Tally()

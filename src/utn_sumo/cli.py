@@ -28,6 +28,7 @@ def cli() -> None:
 @click.option("--demand", help="Scale of the demand profile.  [1.0]")
 @click.option("--profile", help="Demand profile: peak, paper or constant.  [peak]")
 @click.option("--noise", help="Relative standard deviation of correlated demand noise.  [0]")
+@click.option("--disturbance", help="Vehicles an hour that come onto each link amid it, uncounted.  [0]")
 @click.option("--seed", help="Seed of demand and SUMO.  [1]")
 @click.option("--loop-error", help="Share of vehicles by which loops miscount, its spread over the loops.  [0]")
 @click.option("--calibration", help="Calibration file for the model, or none.  [the one beside the net]")

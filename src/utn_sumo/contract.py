@@ -361,6 +361,8 @@ class State:
     """(M,) vehicles that made each turn in the last step; their sum over a link is what left it."""
     fraction: Floats
     """(M,) turning fractions as they are at present; they sum to 1 over a link."""
+    disturbance_veh: Floats
+    """(Z,) vehicles that came onto each link amid it in the last step, less those that ended there: e_z of SPEC 2.1."""
 
     def part(self, links: Ints, turns: Ints) -> State:
         """What of it concerns these links and turns."""
@@ -373,6 +375,7 @@ class State:
             self.past_inflow_veh[:, links],
             self.turned_veh[turns],
             self.fraction[turns],
+            self.disturbance_veh[links],
         )
 
 
@@ -382,10 +385,22 @@ class Forecast:
 
     demand_veh: Floats
     """(Kp, Z) vehicles that will want to enter each source link in each step ahead."""
+    disturbance_veh: Floats | None = None
+    """(Kp, Z) vehicles that will come onto each link amid it, less those that will end there; None for none."""
+    served: tuple[str, ...] = ()
+    """(Z,) by what method each source link's demand was foretold, empty for the others."""
+
+    @property
+    def outside_veh(self) -> tuple[Floats, Floats]:
+        """Demand and disturbance, (Kp, Z) each."""
+        expected = np.zeros_like(self.demand_veh) if self.disturbance_veh is None else self.disturbance_veh
+        return self.demand_veh, expected
 
     def part(self, links: Ints) -> Forecast:
         """What of it concerns these links."""
-        return Forecast(self.demand_veh[:, links])
+        return Forecast(
+            self.demand_veh[:, links], None if self.disturbance_veh is None else self.disturbance_veh[:, links]
+        )
 
 
 @dataclass(frozen=True)

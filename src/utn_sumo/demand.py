@@ -11,6 +11,7 @@ import hashlib
 import os
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -25,6 +26,8 @@ NOISE_PERSISTENCE = 0.7
 """Lag-one correlation of the optional noise, over control steps."""
 NOISE_SHARED = 0.5
 """Share of its variance that all sources have in common."""
+AMID = (0.2, 0.8)
+"""Where on a link's first edge vehicles that start amid it do so, as shares of its length."""
 FORMAT = 3
 """Counted up when the same settings give other trips, so that stale caches are left aside."""
 
@@ -73,14 +76,19 @@ def route_file(
     scale: float,
     noise: float,
     seed: int,
+    disturbance_veh_h: float = 0.0,
     cache: Path | None = None,
 ) -> Path:
     """The route file of these settings, drawn if the cache does not hold it.
 
+    `disturbance_veh_h` start amid each link, for each hour and unit of `scale`.
+
     The cache is `$UTN_CACHE`, else `~/.cache/utn-sumo`. A file is written aside and moved into place, so that
     runs side by side never see half of one.
     """
-    key = repr((FORMAT, profile, duration_s, step_s, scale, noise, seed, network.turns, network.links))
+    key = repr(
+        (FORMAT, profile, duration_s, step_s, scale, noise, seed, disturbance_veh_h, network.turns, network.links)
+    )
     digest = hashlib.sha256(key.encode()).hexdigest()[:16]
     folder = cache or Path(os.environ.get("UTN_CACHE", Path.home() / ".cache" / "utn-sumo"))
     path = folder / f"{network.name}-{profile}-{scale:g}-seed{seed}-{digest}.rou.xml"
@@ -89,14 +97,18 @@ def route_file(
     steps = int(np.ceil(duration_s / step_s))
     rates = drawn_rates_veh_h(network, profile, steps, scale=scale, noise=noise, seed=seed)
     trips = _trips(network, rates, step_s, duration_s, seed)
+    trips += _trips_amid(network, scale * disturbance_veh_h, duration_s, seed)
+    trips.sort(key=lambda trip: trip.depart_s)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".part", delete=False, encoding="utf-8") as part:
             part.write("<routes>\n")
-            for number, (depart_s, edges) in enumerate(trips):
+            for number, trip in enumerate(trips):
+                where = "" if trip.start_m is None else f' departPos="{trip.start_m:.2f}"'
                 part.write(
-                    f'  <vehicle id="v{number}" depart="{depart_s:.2f}" departLane="best" departSpeed="max">'
-                    f"<route edges={quoteattr(' '.join(edges))}/></vehicle>\n"
+                    f'  <vehicle id="v{number}" depart="{trip.depart_s:.2f}" departLane="best"'
+                    f' departSpeed="max"{where}>'
+                    f"<route edges={quoteattr(' '.join(trip.edges))}/></vehicle>\n"
                 )
             part.write("</routes>\n")
         Path(part.name).replace(path)
@@ -105,11 +117,18 @@ def route_file(
     return path
 
 
-def _trips(
-    network: Network, rates_veh_h: Floats, step_s: float, duration_s: float, seed: int
-) -> list[tuple[float, list[str]]]:
-    """(departure time, edges) of every vehicle, in order of departure."""
-    trips: list[tuple[float, int, list[str]]] = []
+class Trip(NamedTuple):
+    """One vehicle's."""
+
+    depart_s: float
+    edges: list[str]
+    start_m: float | None
+    """Where on the first edge; None for its beginning."""
+
+
+def _trips(network: Network, rates_veh_h: Floats, step_s: float, duration_s: float, seed: int) -> list[Trip]:
+    """Trips from outside, in order of departure and, at the same moment, of links."""
+    trips: list[Trip] = []
     for source in np.flatnonzero(network.is_source):
         rng = np.random.default_rng([seed, 0xA7, int(source)])
         counts = rng.poisson(rates_veh_h[:, source] * step_s / 3600)
@@ -117,11 +136,24 @@ def _trips(
             [step * step_s + np.sort(rng.uniform(0, step_s, n)) for step, n in enumerate(counts)]
         )
         trips += [
-            (float(depart_s), int(source), onward(network, int(source), rng))
+            Trip(float(depart_s), onward(network, int(source), rng), None)
             for depart_s in departures[departures < duration_s]
         ]
-    trips.sort(key=lambda trip: trip[:2])
-    return [(depart_s, edges) for depart_s, _, edges in trips]
+    return sorted(trips, key=lambda trip: trip.depart_s)
+
+
+def _trips_amid(network: Network, rate_veh_h: float, duration_s: float, seed: int) -> list[Trip]:
+    """Trips that begin amid a link, for every link."""
+    trips: list[Trip] = []
+    for link, item in enumerate(network.links):
+        rng = np.random.default_rng([seed, 0xE2, link])
+        length_m = network.edge_length_m[item.edges[0]]
+        departures = rng.uniform(0, duration_s, rng.poisson(rate_veh_h * duration_s / 3600))
+        trips += [
+            Trip(float(depart_s), onward(network, link, rng), float(rng.uniform(*AMID) * length_m))
+            for depart_s in departures
+        ]
+    return trips
 
 
 def onward(network: Network, link: int, rng: np.random.Generator) -> list[str]:

@@ -3,7 +3,8 @@
 x is counted in at the entry loops and out at the turn loops, so that it is conserved from link to link. Loops miscount,
 and a count that is summed up never forgets; so a Kalman filter by link holds the count against what can be seen: where
 no queue stands, the vehicles in view of the lane-area detectors and those that entered too short ago to be in view are
-all there are. Its second state is by how much the link's loops differ, which is what makes a count drift.
+all there are. Its second state is by how much the link's loops differ, which is what makes a count drift; its third how
+many come onto the link amid it in a step, which no loop counts (e_z of SPEC 2.1).
 q comes from the lane-area detectors, and its split by turn from who came and who went.
 """
 
@@ -23,6 +24,8 @@ CROWDED_SHARE, CROWDED_SD_VEH = 0.5, 8.0
 """Share from which nothing can be said of those before it, and the standard deviation of what is said just under it."""
 BIAS_STEP_SHARE = 0.01
 """By how much of the loops' error a link's loops may come to differ in a step."""
+DISTURBANCE_STEP_SHARE = 0.1
+"""By how much of what is usual the disturbance of a link may change in a step."""
 SEEN_SD_VEH, SEEN_SD_SHARE = 1.0, 0.1
 """Standard deviation of what can be seen: of all, and of the share that is not in view."""
 FREE_SHARE = 0.4
@@ -40,10 +43,11 @@ TURN_PRIOR_VEH = 200.0
 class Estimator:
     """Follows one plant through its detectors."""
 
-    def __init__(self, network: Network, known: Network, loop_error: float = 0.0):
+    def __init__(self, network: Network, known: Network, loop_error: float = 0.0, disturbance_veh: float = 0.0):
         """`network` is the road as it is, `known` the same as the controllers know it: its delays and turning.
 
         `loop_error` is by how much loops miscount, as in `detectors.Miscount`; at 0 they are believed.
+        `disturbance_veh` is how many vehicles usually come onto a link amid it in a control step; at 0 nobody does.
         """
         links, turns = len(network.links), len(network.turns)
         self.network = network
@@ -51,8 +55,16 @@ class Estimator:
         self._x_veh = np.zeros(links)
         self._bias = np.zeros(links)
         """(Z,) how much more the exit loops count than the entry loops, relative."""
-        self._covariance = np.zeros((links, 2, 2))
+        self._disturbance_veh = np.zeros(links)
+        """(Z,) as `State.disturbance_veh`."""
+        self._usual_veh = np.zeros(links)
+        """(Z,) what it is in a usual step."""
+        self._covariance = np.zeros((links, 3, 3))
         self._covariance[:, 1, 1] = 2 * loop_error**2
+        self._covariance[:, 2, 2] = disturbance_veh**2
+        # They come at random: their number varies by its root.
+        self._disturbance_variance = disturbance_veh
+        self._disturbance_step_variance = (DISTURBANCE_STEP_SHARE * disturbance_veh) ** 2
         # A loop that misses a share p at random adds p (1 - p) to the variance for each vehicle; p is normal.
         self._count_variance = np.sqrt(2 / np.pi) * loop_error
         self._bias_step_variance = (BIAS_STEP_SHARE * loop_error) ** 2
@@ -93,13 +105,13 @@ class Estimator:
     def _count(self, seen: Measurement, entered_veh: Floats) -> None:
         """X by the Kalman filter: counted on, and held against what is seen where the road is free."""
         left = self._by_link(seen.turned_veh)
-        x = self._x_veh + entered_veh - (1 - self._bias) * left
-        move = np.zeros_like(self._covariance)
-        move[:, 0, 0] = move[:, 1, 1] = 1.0
-        move[:, 0, 1] = left
+        x = self._x_veh + entered_veh - (1 - self._bias) * left + self._usual_veh
+        move = np.tile(np.eye(3), (len(x), 1, 1))
+        move[:, 0, 1], move[:, 0, 2] = left, 1.0
         covariance = move @ self._covariance @ move.transpose(0, 2, 1)
-        covariance[:, 0, 0] += self._count_variance * (entered_veh + left)
+        covariance[:, 0, 0] += self._count_variance * (entered_veh + left) + self._disturbance_variance
         covariance[:, 1, 1] += self._bias_step_variance
+        covariance[:, 2, 2] += self._disturbance_step_variance
 
         hidden = (self._hidden * self._past_inflow_veh).sum(axis=0)
         crowd = (seen.seen_veh / self._watched_veh - QUIET_SHARE) / (CROWDED_SHARE - QUIET_SHARE)
@@ -109,9 +121,13 @@ class Estimator:
         residual = seen.seen_veh + hidden - x
         self._covariance = covariance - gain[:, :, None] * covariance[:, None, 0, :]
         self._bias = self._bias + gain[:, 1] * residual
+        self._usual_veh = self._usual_veh + gain[:, 2] * residual
         # What the lane-area detectors see is there; what they don't see must fit on the rest of the road.
         unwatched_veh = self.network.storage_veh - self._watched_veh
+        before = self._x_veh
         self._x_veh = np.clip(x + gain[:, 0] * residual, seen.seen_veh, seen.seen_veh + unwatched_veh)
+        if self._disturbance_variance > 0:
+            self._disturbance_veh = self._x_veh - before - entered_veh + (1 - self._bias) * left
 
     def _queue(self, seen: Measurement) -> None:
         """q: standing in view, and all beyond the view where the view stands full.
@@ -169,4 +185,5 @@ class Estimator:
             past_inflow_veh=self._past_inflow_veh.copy(),
             turned_veh=turned_veh,
             fraction=self._fraction(),
+            disturbance_veh=self._disturbance_veh.copy(),
         )

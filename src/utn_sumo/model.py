@@ -11,7 +11,7 @@ Units: vehicles per model step (flow times step) throughout, so that a rate in S
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -337,6 +337,17 @@ class LinkModel:
             if self.operations.settled(last, inflow):
                 break
         return self.after(state, demand_veh, flows), flows
+
+    def disturbed(self, state: ModelState, disturbance_veh: Any) -> ModelState:
+        """The state when `disturbance_veh` (Z,) have come onto the links, or left them, amid them (e_z of SPEC 2.1).
+
+        As far as there is room, or somebody to leave who is not queued. Who comes so reaches the queue within the step.
+        """
+        ops = self.operations
+        room = ops.maximum(self.numbers.storage_veh - state.x_veh, 0.0)
+        moving = state.x_veh - self.by_link(state.q_veh)
+        change = ops.minimum(ops.maximum(disturbance_veh, -moving), room)
+        return replace(state, x_veh=state.x_veh + change)
 
     def terms(
         self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any, green_end_s: Any | None = None

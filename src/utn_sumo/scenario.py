@@ -29,6 +29,8 @@ class Scenario(BaseModel):
     profile: Literal["peak", "paper", "constant"] = "peak"
     noise: float = Field(0.0, ge=0, le=2)
     """Standard deviation of the correlated noise on the demand, relative."""
+    disturbance: float = Field(0.0, ge=0, le=1000)
+    """Vehicles an hour that come onto each link amid it, where no loop counts them, for each unit of `demand`."""
     loop_error: float = Field(0.0, ge=0, le=0.2)
     """Standard deviation, over the loops, of the share of vehicles that a loop misses or counts twice."""
     calibration: str | None = None

@@ -39,6 +39,7 @@ def random_state(network: Network, rng: np.random.Generator) -> State:
         past_inflow_veh=entered / entered.sum(axis=0) * levels(rng, links) * (x - queue),
         turned_veh=np.zeros(len(network.turns)),
         fraction=random_split(network, rng),
+        disturbance_veh=np.zeros(links),
     )
 
 
@@ -114,6 +115,13 @@ def _queue_beyond(network: Network, rng: np.random.Generator, horizon: int) -> t
     return replace(state, q_veh=2 * state.q_veh + 1), random_forecast(network, rng, horizon)
 
 
+def _disturbed(network: Network, rng: np.random.Generator, horizon: int) -> tuple[State, Forecast]:
+    """Many are expected to come onto links amid them, and more to vanish than there are."""
+    state, forecast = random_state(network, rng), random_forecast(network, rng, horizon)
+    unruly = rng.uniform(-1, 1, forecast.demand_veh.shape) * network.storage_veh
+    return state, replace(forecast, disturbance_veh=unruly)
+
+
 def _ordinary(network: Network, rng: np.random.Generator, horizon: int) -> tuple[State, Forecast]:
     return random_state(network, rng), random_forecast(network, rng, horizon)
 
@@ -128,5 +136,6 @@ HARD: dict[str, Callable[[Network, np.random.Generator, int], tuple[State, Forec
     "stale": _stale,
     "dead link": _dead_link,
     "queue beyond its link": _queue_beyond,
+    "disturbed": _disturbed,
 }
 """What a controller must have a plan for, by name: (network, rng, horizon) to a state and a forecast."""

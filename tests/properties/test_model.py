@@ -100,6 +100,20 @@ def test_queues_fit_on_their_links_and_links_within_their_storage_for_ever(
         assert (state.x_veh <= model.network.storage_veh + 1e-9).all()
 
 
+@given(seed=SEEDS)
+def test_a_disturbance_is_taken_as_far_as_it_fits(model_of: Callable[[float], LinkModel], seed: int) -> None:
+    model, rng = model_of(120.0), np.random.default_rng(seed)
+    state, wish = some_state(model, rng), rng.normal(0, 60, len(model.network.links))
+    after = model.disturbed(state, wish)
+    queue, change = model.by_link(state.q_veh), after.x_veh - state.x_veh
+    assert (after.x_veh >= queue - 1e-9).all()
+    assert (after.x_veh <= model.network.storage_veh + 1e-9).all()
+    assert (change * wish >= -1e-9).all()
+    assert (np.abs(change) <= np.abs(wish) + 1e-9).all()
+    fits = (state.x_veh + wish <= model.network.storage_veh) & (state.x_veh + wish >= queue)
+    assert change[fits] == pytest.approx(wish[fits])
+
+
 @given(seed=SEEDS, step_s=STEPS_S)
 def test_one_more_sweep_changes_nothing(model_of: Callable[[float], LinkModel], seed: int, step_s: float) -> None:
     model, rng = model_of(step_s), np.random.default_rng(seed)

@@ -150,3 +150,21 @@ def test_no_demand_gives_an_empty_file_that_sumo_can_read(utn17: Network, tmp_pa
     root = ET.parse(draw(utn17, tmp_path, scale=0.0)).getroot()
     assert root.tag == "routes"
     assert len(root) == 0
+
+
+def test_a_disturbance_adds_vehicles_amid_every_link_and_changes_no_other(
+    utn17: Network, trips: Trips, tmp_path: Path
+) -> None:
+    vehicles = ET.parse(draw(utn17, tmp_path, disturbance_veh_h=90.0, scale=1.0)).getroot().findall("vehicle")
+    amid = [vehicle for vehicle in vehicles if vehicle.get("departPos")]
+    others = [vehicle for vehicle in vehicles if not vehicle.get("departPos")]
+    assert [vehicle[0].get("edges", "").split() for vehicle in others] == [edges for _, edges in trips]
+    counts = Counter(vehicle[0].get("edges", "").split()[0] for vehicle in amid)
+    assert set(counts) == {link.edges[0] for link in utn17.links}
+    # Poisson: within five standard deviations on every link.
+    assert all(abs(count - 90 * HOURS) < 5 * np.sqrt(90 * HOURS) for count in counts.values())
+    for vehicle in amid:
+        edge = vehicle[0].get("edges", "").split()[0]
+        assert 0 < float(vehicle.get("departPos", "nan")) < utn17.edge_length_m[edge]
+    departures = [float(vehicle.get("depart", "nan")) for vehicle in vehicles]
+    assert departures == sorted(departures)

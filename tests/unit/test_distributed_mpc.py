@@ -60,7 +60,7 @@ def quiet_state(net: Network, x: Floats | None = None, q: Floats | None = None) 
     q = turns if q is None else q
     on_links = np.bincount(net.turn_link, q).astype(float) if x is None else x
     past = np.zeros((net.delay_samples, len(net.links)))
-    return State(0, 0.0, on_links, q, links, past, turns, net.fraction)
+    return State(0, 0.0, on_links, q, links, past, turns, net.fraction, links)
 
 
 def some_forecast(net: Network, rng: np.random.Generator, horizon: int = HORIZON) -> Forecast:
@@ -227,6 +227,27 @@ def test_green_goes_where_the_turning_fractions_let_traffic_out(utn17: Network, 
         first, second = (green[np.flatnonzero(utn17.serves[:, turns].any(axis=1))].item() for turns in (out, blocked))
         longer.append(first - second)
     assert min(longer) > 10
+
+
+def test_who_is_expected_to_come_amid_a_link_gets_green_there(utn17: Network, cost: str) -> None:
+    rng = np.random.default_rng(8)
+    forecast, link = some_forecast(utn17, rng), int(np.flatnonzero(~utn17.is_source)[0])
+    disturbance = np.zeros((HORIZON, 17))
+    disturbance[:, link] = 40.0
+    greens = [
+        DistributedMPC(utn17, cost=cost).plan(quiet_state(utn17), each).green_s
+        for each in (forecast, replace(forecast, disturbance_veh=disturbance))
+    ]
+    serving = [s for s, stage in enumerate(utn17.stages) if {utn17.turns[t].link for t in stage.turns} == {link}]
+    assert (greens[1] - greens[0])[serving].sum() > 1.0
+
+
+@pytest.mark.parametrize("step_s", [None, 40.0])
+@given(seed=SEEDS)
+@limits(max_examples=25)
+def test_no_disturbance_leaves_the_controller_without_a_plan(utn17: Network, step_s: float | None, seed: int) -> None:
+    case = HARD["disturbed"](utn17, np.random.default_rng(seed), 3)
+    assert_admissible(utn17, DistributedMPC(utn17, horizon=3, step_s=step_s).plan(*case))
 
 
 def test_who_reaches_the_queue_after_its_green_leaves_a_step_later(utn17: Network) -> None:

@@ -229,6 +229,28 @@ class TestMiscountingLoops:
         assert np.abs(road.drive(30)).max() <= 1.5
 
 
+class TestDisturbance:
+    """Vehicles come onto the links amid them, where no loop counts them."""
+
+    def drive(self, net: Network, told_veh: float, steps: int = 60) -> State:
+        estimator, coming_veh = Estimator(net, net, 0.0, told_veh), np.linspace(0, 4, 17)
+        per_m = FreeRoad.rate_veh / net.control_step_s / free_speed_m_s(net)
+        seen = per_m * WATCHED_M + 1.0
+        state = estimator.initial()
+        for _ in range(steps):
+            leaving = spread(net, FreeRoad.rate_veh + coming_veh)
+            entered = each(net, FreeRoad.rate_veh)
+            state = estimator.update(counted(net, entered=entered, turned_veh=leaving, seen_veh=seen), nobody(net))
+        return state
+
+    def test_it_is_found_where_the_road_is_seen_to_hold_more_than_was_counted(self, utn17: Network) -> None:
+        state = self.drive(utn17, 2.0)
+        assert state.disturbance_veh == pytest.approx(np.linspace(0, 4, 17), abs=0.2)
+
+    def test_where_there_is_none_to_be_none_is_found(self, utn17: Network) -> None:
+        assert not self.drive(utn17, 0.0, 5).disturbance_veh.any()
+
+
 def test_a_crowded_view_corrects_no_count(utn17: Network) -> None:
     states = []
     for loop_error in (0.0, LOOP_ERROR):

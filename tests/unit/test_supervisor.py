@@ -32,7 +32,7 @@ class Scripted:
 def asked(net: Network, *answers: Any) -> list[Decision]:
     links, turns = np.zeros(len(net.links)), np.zeros(len(net.turns))
     past = np.zeros((net.delay_samples, len(net.links)))
-    state = State(0, 0.0, links, turns, links, past, turns, net.fraction)
+    state = State(0, 0.0, links, turns, links, past, turns, net.fraction, links)
     supervisor = Supervisor(net, Scripted(answers))
     return [supervisor.ask(state, Forecast(links[None])) for _ in answers]
 

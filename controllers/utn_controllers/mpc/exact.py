@@ -11,7 +11,7 @@ Decided are the greens and, at every model step, the state, the inflow and the r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,12 +76,23 @@ class ExactProblem:
         past = tuple(ca.SX.sym(f"past{lag}", links) for lag in range(self._model.lags))
         start = ModelState(ca.SX.sym("x", links), ca.SX.sym("q", turns), ca.SX.sym("waiting", links), past)
         demand, fraction = ca.SX.sym("demand", links, settings.horizon), ca.SX.sym("fraction", turns)
+        disturbance = ca.SX.sym("disturbance", links, settings.horizon)
         rounding, scale = ca.SX.sym("rounding", 2), ca.SX.sym("scale")
         model = LinkModel(network, self._model.step_s, SmoothOperations(rounding[0], rounding[1]))
-        states, variables, rows = self._predict(model, start, greens, demand, fraction)
+        states, variables, rows = self._predict(model, start, greens, (demand, disturbance), fraction)
         budgets = ca.vec(ca.mtimes(ca.DM(self._by_junction), greens))
         # In the order in which `_solve_once` fills them in.
-        known = [start.x_veh, start.q_veh, start.source_queue_veh, *past, ca.vec(demand), fraction, rounding, scale]
+        known = [
+            start.x_veh,
+            start.q_veh,
+            start.source_queue_veh,
+            *past,
+            ca.vec(demand),
+            ca.vec(disturbance),
+            fraction,
+            rounding,
+            scale,
+        ]
         statement = {
             "x": ca.vertcat(ca.vec(greens), *variables),
             "p": ca.vertcat(*known),
@@ -92,9 +103,12 @@ class ExactProblem:
         self._bounds = self._all_bounds(statement["x"].numel(), statement["g"].numel() - budgets.numel())
 
     def _predict(
-        self, model: LinkModel, state: ModelState, greens: Any, demand: Any, fraction: Any
+        self, model: LinkModel, state: ModelState, greens: Any, outside: tuple[Any, Any], fraction: Any
     ) -> tuple[list[ModelState], list[Any], list[Any]]:
-        """The horizon: the state after each model step, the variables, and what the model says has to be 0."""
+        """The horizon: the state after each model step, the variables, and what the model says has to be 0.
+
+        `outside` are demand and disturbance (Z, horizon).
+        """
         import casadi as ca  # noqa: PLC0415 - heavy
 
         links, turns = len(self.network.links), len(self.network.turns)
@@ -103,9 +117,11 @@ class ExactProblem:
             control_step, substep = divmod(step, self._substeps)
             green = greens[:, min(control_step, self.settings.control_horizon - 1)]
             shown_s, end_s = smooth_windows(model, green, substep * model.step_s)
-            demand_veh = demand[:, control_step] / self._substeps
+            demand_veh, disturbance_veh = (each[:, control_step] / self._substeps for each in outside)
             inflow, room = ca.SX.sym(f"inflow{step}", links), ca.SX.sym(f"room{step}", links)
             x, q, waiting = ca.SX.sym(f"x{step}", links), ca.SX.sym(f"q{step}", turns), ca.SX.sym(f"w{step}", links)
+            # Without the bounds of `LinkModel.disturbed`, whose rounding would tell on every step.
+            state = replace(state, x_veh=state.x_veh + disturbance_veh)
             flows = model.flows(model.terms(state, shown_s, demand_veh, fraction, end_s), inflow, room)
             after = model.after(state, demand_veh, flows)
             variables += [inflow, room, x, q, waiting]
@@ -124,7 +140,7 @@ class ExactProblem:
         one way is tried the other. Raises ControllerError if both fail, or for numbers that are not finite.
         """
         counted = state.x_veh, state.q_veh, state.source_queue_veh, state.past_inflow_veh, state.fraction
-        if not all(np.isfinite(each).all() for each in (*counted, forecast.demand_veh, greens_s)):
+        if not all(np.isfinite(each).all() for each in (*counted, *forecast.outside_veh, greens_s)):
             raise ControllerError("the exact problem: its state, forecast or start is not finite")
         ways = [ROUNDINGS[-1:], ROUNDINGS] if near else [ROUNDINGS, ROUNDINGS[-1:]]
         iterations, status = 0, ""
@@ -148,7 +164,7 @@ class ExactProblem:
         cost = float(_cost(self.network, self.settings, states[1:], [*start_s]))
         first, scale = states[0], COST_AT_START / max(cost, 1.0)
         known = [first.x_veh, first.q_veh, first.source_queue_veh, *first.past_inflow_veh]
-        known += [forecast.demand_veh[:horizon].ravel(), state.fraction, rounding, [scale]]
+        known += [*(each[:horizon].ravel() for each in forecast.outside_veh), state.fraction, rounding, [scale]]
         guess = [start_s.ravel()]
         for moved, after in zip(flows, states[1:], strict=True):
             guess += [moved.inflow_veh, moved.open_room_veh, after.x_veh, after.q_veh, after.source_queue_veh]
@@ -230,8 +246,9 @@ def _roll_out(
     substeps = windows.shown_s.shape[1]
     for step in range(horizon * substeps):
         at = min(step // substeps, len(greens_s) - 1), step % substeps
-        demand_veh = forecast.demand_veh[step // substeps] / substeps
-        after, moved = model.step(states[-1], windows.shown_s[at], demand_veh, state.fraction, windows.end_s[at])
+        demand_veh, disturbance_veh = (each[step // substeps] / substeps for each in forecast.outside_veh)
+        now = model.disturbed(states[-1], disturbance_veh)
+        after, moved = model.step(now, windows.shown_s[at], demand_veh, state.fraction, windows.end_s[at])
         states.append(after)
         flows.append(moved)
     return states, flows

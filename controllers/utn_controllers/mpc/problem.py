@@ -141,6 +141,8 @@ class JunctionProblem:
             [self._by_junction(each) for each in (*constants, part.green_budget_s)], axis=1
         )
         self._box = self._simple_bounds()
+        self._disturbed_so_far_veh = np.zeros((self.steps, len(part.links)))
+        """Of the last programmes."""
 
     def hessians(self) -> Iterator[Floats]:
         """Each junction's Hessian (n, n)."""
@@ -180,14 +182,17 @@ class JunctionProblem:
         behind = (self._begin_s + model.step_s - entry_s) / model.step_s
         share = _share(behind[:, None] - np.arange(lags + 1)[:, None])
         before = _share(-entry_s[:lags, None] / part.sample_s - history)
+        still_in_green = (before * past[:, link]).sum(axis=1)
+        self._disturbed_so_far_veh = self._disturbed_veh(forecast, x, x - queue, still_in_green)
         parameters = [
             x,
             q,
             state.source_queue_veh,
             forecast.demand_veh[self._control_step] / self.substeps,
+            np.diff(self._disturbed_so_far_veh, axis=0, prepend=0.0),
             state.fraction,
             share,
-            (before * past[:, link]).sum(axis=1),
+            still_in_green,
             timing.shown,
             timing.opening,
             # A source that holds more than it can, by a wrong count, may go on holding it.
@@ -220,7 +225,7 @@ class JunctionProblem:
         """
         model, steps, lags = self.model, self.steps, self.structure.lags
         inflow, leaving = (self._together(solution, block) for block in (self.layout.inflow, self.layout.leaving))
-        x = state.x_veh + np.cumsum(inflow - leaving @ self._leaves.T, axis=0)
+        x = state.x_veh + self._disturbed_so_far_veh + np.cumsum(inflow - leaving @ self._leaves.T, axis=0)
         # On the way at the end of step k is who entered within the delay that step k + 1 was frozen at.
         held = self._frozen_delay_s(self._leaves @ state.q_veh, delay_s)
         behind = held[self._following] / model.step_s
@@ -233,6 +238,21 @@ class JunctionProblem:
         way[:lags] += (still * state.past_inflow_veh).sum(axis=1)
         ahead = np.minimum(np.arange(steps) + self.substeps, steps) - 1
         return np.asarray(model.delay_s(np.maximum(x - way, 0.0))[ahead])
+
+    def _disturbed_veh(self, forecast: Forecast, x: Floats, moving: Floats, still_in_green: Floats) -> Floats:
+        """(model steps, Z) what the disturbances come to by each model step.
+
+        No more than fits, and no fewer than are neither queued nor still on the way at a green's end: with nobody
+        entering or leaving there is then always a feasible flow. `still_in_green` is (lags, M).
+        """
+        if forecast.disturbance_veh is None:
+            return np.zeros((self.steps, len(x)))
+        sum_veh = np.cumsum(forecast.disturbance_veh[self._control_step] / self.substeps, axis=0)
+        least = np.tile(-moving, (self.steps, 1))
+        link = self.place.part.turn_link
+        np.maximum.at(least[: len(still_in_green)].T, link, (still_in_green - moving[link]).T)
+        room = np.maximum(self.place.part.storage_veh - x, 0.0)
+        return np.clip(sum_veh, np.minimum(least, 0.0), room)
 
     def _frozen_delay_s(self, queue_veh: Floats, later_s: Floats | None) -> Floats:
         """(model steps, Z) delays: the state's own, then those foreseen, or without them the state's own for ever."""

@@ -161,6 +161,7 @@ class Statement:
             "q": ca.SX.sym("q", turns),
             "waiting": ca.SX.sym("waiting", links),
             "demand": over("demand", structure.steps, links),
+            "disturbance": over("disturbance", structure.steps, links),
             "fraction": ca.SX.sym("fraction", turns),
             "share_in_green": over("share_in_green", structure.steps * (structure.lags + 1), turns),
             "still_in_green": over("still_in_green", structure.lags, turns),
@@ -182,6 +183,7 @@ class Statement:
         q: Any,
         waiting: Any,
         demand: list[Any],
+        disturbance: list[Any],
         fraction: Any,
         share_in_green: list[Any],
         still_in_green: list[Any],
@@ -210,6 +212,7 @@ class Statement:
         for step in range(structure.steps):
             control_step, substep = divmod(step, structure.substeps)
             green = z[layout.green[min(control_step, settings.control_horizon - 1)]]
+            x = x + disturbance[step]
             leaving, inflow, over = z[layout.leaving[step]], z[layout.inflow[step]], z[layout.over_storage[step]]
             inflows = [inflow, *inflows][:lags]
             # Who can be in the queue before the green ends: everybody but those still on the way then. q holds who was

@@ -115,6 +115,7 @@ class MacroscopicPlant:
             past_inflow_veh=past,
             turned_veh=turned,
             fraction=before.fraction,
+            disturbance_veh=before.disturbance_veh,
         )
         return Passed(
             state=self.state,
@@ -138,4 +139,4 @@ def _empty(network: Network) -> State:
     links, turns = len(network.links), len(network.turns)
     past_inflow_veh = np.zeros((network.delay_samples, links))
     nobody, none_by_turn = np.zeros(links), np.zeros(turns)
-    return State(0, 0.0, nobody, none_by_turn, nobody, past_inflow_veh, none_by_turn, network.fraction)
+    return State(0, 0.0, nobody, none_by_turn, nobody, past_inflow_veh, none_by_turn, network.fraction, nobody)
