@@ -1,4 +1,4 @@
-"""What will come from outside: the forecast that a controller is handed each control step."""
+"""The historical profile as a forecast: what demand is expected where nothing is learnt from the day itself."""
 
 from __future__ import annotations
 

@@ -1,0 +1,428 @@
+"""STARIMA: an ARIMA of many series whose coefficients are shared by all sites and act through spatial weights.
+
+Pfeifer and Deutsch (1980), as a state-space model of statsmodels: exact likelihood, missing values, forecasts with
+intervals, everything that statsmodels' own results can do.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from statsmodels.tools.sm_exceptions import ConvergenceWarning
+from statsmodels.tsa.statespace.initialization import Initialization
+from statsmodels.tsa.statespace.mlemodel import MLEModel, MLEResults, MLEResultsWrapper
+
+from utn_sumo.contract import Floats
+from utn_sumo.errors import SettingError, did_you_mean
+from utn_sumo.prediction import conditional, space_time
+from utn_sumo.prediction.form import Form, Term, difference, difference_polynomial
+from utn_sumo.prediction.scoring import Maximum, maximise
+from utn_sumo.prediction.weights import checked
+
+METHODS = ("exact", "conditional")
+MOST_STATES = 3000
+COVARIANCE = "Covariance matrix calculated from the information of the conditional likelihood."
+
+
+class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
+    r"""Space-time autoregressive integrated moving average model of N series.
+
+    With w_t the series differenced d times, and D times at the season s, and W_0 = I,
+
+        w_t - mu = sum_i sum_l ar_il W_l (w_{t-i} - mu) + sum_i sum_l ma_il W_l e_{t-i} + e_t,   e_t ~ N(0, sigma2 I).
+
+    Signs are statsmodels': ma is +theta, where Pfeifer and Deutsch write -theta. Parameters are called
+    `ar.L1.S0` (time lag 1, spatial order 0), `ma.L1.S1`, `sigma2`, and `mean.<series>`.
+
+    endog               (T, N) array or DataFrame; a (T,) one is one site. NaN is a missing value.
+    order               (p, d, q).
+    spatial             (m, n): spatial orders of the autoregressive and of the moving average part, from 0 to m or n;
+                        each an int for all time lags, or one int per time lag.
+    weights             W_1..W_k, or W_0..W_k with W_0 = I; each (N, N), its row z the weights of z's neighbours. Rows are
+                        divided by their sums; a site without neighbours has a row of zeros. See `network_weights`.
+    seasonal_diff       (D, s): D differences at a season of s steps.
+    trend               "n": none, mu = 0. "c": a mean mu of each differenced series: its level, or its drift where d is 1.
+    heteroscedastic     each site has an innovation variance of its own, `sigma2.<series>`.
+    enforce_stationarity, enforce_invertibility
+                        refuse other parameters, and start from the stationary distribution; without the first all
+                        states start diffuse, as in statsmodels' SARIMAX.
+
+    Single coefficients are left out with `model.fit_constrained({"ma.L1.S0": 0})`.
+
+    Differences are taken inside the state space, which keeps the levels of the last d + D s rows: they are integrated
+    back with the right variances, and a missing value costs one value, not every difference it is part of. As in
+    SARIMAX these states start approximately diffuse and the first d + D s rows do not count in the likelihood.
+    There are N (max(p, q + 1) + d + D s) states: rather than differencing at a long season subtract its mean profile.
+
+    Further keywords go to `MLEModel`. Raises SettingError for whatever is out of range.
+    """
+
+    def __init__(
+        self,
+        endog: Any,
+        order: tuple[int, int, int] = (1, 0, 0),
+        spatial: tuple[int | Sequence[int], int | Sequence[int]] = (0, 0),
+        weights: Sequence[Any] = (),
+        *,
+        seasonal_diff: tuple[int, int] = (0, 0),
+        trend: Literal["n", "c"] = "n",
+        heteroscedastic: bool = False,
+        enforce_stationarity: bool = True,
+        enforce_invertibility: bool = True,
+        **kwargs: Any,
+    ):
+        series = _series(endog)
+        sites = 1 if series.ndim == 1 else series.shape[1]
+        self._settings = {
+            "order": order,
+            "spatial": spatial,
+            "weights": weights,
+            "seasonal_diff": seasonal_diff,
+            "trend": trend,
+            "heteroscedastic": heteroscedastic,
+            "enforce_stationarity": enforce_stationarity,
+            "enforce_invertibility": enforce_invertibility,
+            **kwargs,
+        }
+        if trend not in ("n", "c"):
+            raise SettingError(f'trend: {trend!r} is unknown; give "n" for none or "c" for a mean of each series')
+        p, d, q = _integers("order", order, 3)
+        times, period = _integers("seasonal_diff", seasonal_diff, 2)
+        if times and not period:
+            raise SettingError(
+                f"seasonal_diff: {times} differences at a season of {period}; a season has 1 step or more"
+            )
+        matrices = checked(weights, sites)
+        if not isinstance(spatial, Sequence) or len(spatial) != 2:  # noqa: PLR2004
+            raise SettingError(
+                f"spatial: {spatial!r} is no pair; give (m, n), the spatial orders of the AR and MA parts"
+            )
+        ar = _terms("AR", p, spatial[0], len(matrices) - 1)
+        ma = _terms("MA", q, spatial[1], len(matrices) - 1)
+        self.order, self.seasonal_diff = (p, d, q), (times, period)
+        self.enforce_stationarity, self.enforce_invertibility = enforce_stationarity, enforce_invertibility
+        self.polynomial = difference_polynomial(d, (times, period))
+        """Of the differences, by power of the backshift."""
+        span, self._blocks = len(self.polynomial) - 1, max(p, q + 1)
+        self._levels = sites * span
+        states = self._levels + sites * self._blocks
+        if states > MOST_STATES:
+            raise SettingError(
+                f"STARIMA: {states} states are more than {MOST_STATES}; subtract the mean profile of a long season"
+                " rather than differencing at it, or take fewer series"
+            )
+        super().__init__(series, k_states=states, k_posdef=sites, **kwargs)
+        names = [str(name) for name in np.atleast_1d(self.endog_names)]
+        self.form = Form(ar, ma, matrices, tuple(names), trend == "c", heteroscedastic)
+        self._lay_out(sites, span)
+        self.ssm.initialization = self._initialization("approximate_diffuse")
+        if "loglikelihood_burn" not in kwargs:
+            self.loglikelihood_burn = span + (0 if enforce_stationarity else self._blocks)
+
+    def _lay_out(self, sites: int, span: int) -> None:
+        """What the parameters don't touch: the states are the last levels, then the blocks of Harvey's ARMA form."""
+        identity, start = np.eye(sites), self._levels
+        self["design", :, :start] = np.kron(-self.polynomial[1:], identity)
+        self["design", :, start : start + sites] = identity
+        transition = np.zeros((self.k_states, self.k_states))
+        if span:
+            transition[:sites] = self["design"]
+            transition[sites:start, : start - sites] = np.eye(start - sites)
+        transition[start:-sites, start + sites :] = np.eye(self.k_states - start - sites)
+        self._fixed_transition = transition
+        self._fixed_selection = np.zeros((self.k_states, sites))
+        self._fixed_selection[start : start + sites] = identity
+
+    def _initialization(self, levels: Literal["approximate_diffuse", "known"]) -> Any:
+        """Levels diffuse, or known to be zero; the rest at its stationary distribution where that is enforced."""
+        start = Initialization(self.k_states, approximate_diffuse_variance=self.ssm.initial_variance)
+        split = self._levels if self.enforce_stationarity else self.k_states
+        if split and levels == "known":
+            start.set((0, split), "known", constant=np.zeros(split), stationary_cov=np.zeros((split, split)))
+        elif split:
+            start.set((0, split), "approximate_diffuse")
+        if split < self.k_states:
+            start.set((split, self.k_states), "stationary")
+        return start
+
+    def clone(self, endog: Any, exog: Any = None, **kwargs: Any) -> STARIMA:
+        """The same model of other data."""
+        if exog is not None:
+            raise SettingError("exog: a STARIMA has no exogenous regressors; subtract their effect from the series")
+        return STARIMA(endog, **{**self._settings, **kwargs})
+
+    @property
+    def param_names(self) -> list[str]:
+        """In the order of the parameters."""
+        return self.form.names
+
+    @property
+    def state_names(self) -> list[str]:
+        """The last levels of each series, newest first, then the blocks of its ARMA form."""
+        back = range(1, 1 + self._levels // self.k_endog)
+        return [
+            *(f"level.L{lag}.{site}" for lag in back for site in self.form.sites),
+            *(f"arma.{block}.{site}" for block in range(self._blocks) for site in self.form.sites),
+        ]
+
+    @property
+    def start_params(self) -> Floats:
+        """The conditional estimates."""
+        return np.asarray(self.handle_params(self._conditional_maximum(None, 50).params))
+
+    @property
+    def _res_classes(self) -> dict[str, Any]:
+        return {"fit": (STARIMAResults, MLEResultsWrapper)}
+
+    def update(self, params: Any, **kwargs: Any) -> Any:
+        """Set the state space to these parameters; SettingError where they are inadmissible."""
+        params = super().update(params, **kwargs)
+        self._admit(np.real(params))
+        form, start, sites = self.form, self._levels, self.k_endog
+        transition = self._fixed_transition.astype(params.dtype)
+        for block, matrix in enumerate(form.ar_matrices(params)):
+            rows = start + block * sites
+            transition[rows : rows + sites, start : start + sites] += matrix
+        selection = self._fixed_selection.astype(params.dtype)
+        for block, matrix in enumerate(form.ma_matrices(params), start=1):
+            rows = start + block * sites
+            selection[rows : rows + sites] = matrix
+        self["transition"], self["selection"] = transition, selection
+        self["state_cov"] = np.diag(form.variance_of(params))
+        if form.mean:
+            mean = form.mean_of(params)
+            self["obs_intercept"] = mean[:, None]
+            if start:
+                intercept = np.zeros((self.k_states, 1), dtype=params.dtype)
+                intercept[:sites, 0] = mean
+                self["state_intercept"] = intercept
+        return params
+
+    def _admit(self, params: Floats) -> None:
+        variance = self.form.variance_of(params)
+        if not (variance > 0).all():
+            raise SettingError(f"STARIMA: a variance sigma2 of {variance.min():g} is not positive; give one above 0")
+        if self.enforce_stationarity and (root := self.form.ar_root(params)) >= 1:
+            raise SettingError(
+                f"STARIMA: the AR coefficients are not stationary (largest root {root:.4g}, it must be below 1);"
+                " difference the series, lower p, or set enforce_stationarity=False"
+            )
+        if self.enforce_invertibility and (root := self.form.ma_root(params)) >= 1:
+            raise SettingError(
+                f"STARIMA: the MA coefficients are not invertible (largest root {root:.4g}, it must be below 1);"
+                " difference less, lower q, or set enforce_invertibility=False"
+            )
+
+    def fit(
+        self,
+        start_params: Any = None,
+        *,
+        method: Literal["exact", "conditional"] = "exact",
+        maxiter: int = 50,
+        cov_type: str | None = None,
+        cov_kwds: dict[str, Any] | None = None,
+        includes_fixed: bool = False,
+    ) -> STARIMAResults:
+        """Estimate the parameters.
+
+        `exact` climbs the Kalman filter's likelihood by scoring, from the conditional estimates. `conditional` takes the
+        first p rows as given and what was before as the mean: least squares where there is no MA part. It filters only
+        once, and is the one for many sites, or for a hundred with means or variances of their own. Standard errors
+        come from the information of the conditional likelihood, or by statsmodels' own `cov_type`.
+        """
+        if method not in METHODS:
+            raise SettingError(f"method: {method!r} is unknown; {did_you_mean(method, METHODS)}")
+        if start_params is not None:
+            start_params = self.handle_params(start_params, transformed=True, includes_fixed=includes_fixed)
+        found = self._conditional_maximum(start_params, maxiter)
+        if method == "exact":
+            found = self._exact_maximum(found.params, maxiter)
+        if not found.converged:
+            warnings.warn(
+                f"STARIMA: no maximum of the likelihood after {found.iterations} iterations;"
+                " lower the order or raise maxiter",
+                ConvergenceWarning,
+                stacklevel=2,
+            )
+        params = self.handle_params(found.params)
+        if cov_type is None:
+            cov_type, cov_kwds = (
+                "custom",
+                {
+                    "custom_cov_type": "expected",
+                    "custom_cov_params": self._covariance(params),
+                    "custom_description": COVARIANCE,
+                },
+            )
+        results: STARIMAResults = self.filter(params, includes_fixed=True, cov_type=cov_type, cov_kwds=cov_kwds)
+        results.mle_retvals = {"converged": found.converged, "iterations": found.iterations, "fopt": found.value}
+        results.mle_settings = {"method": method, "maxiter": maxiter}
+        return results
+
+    @property
+    def _free(self) -> Any:
+        """Places of the parameters that are not fixed."""
+        return (
+            np.array(self._free_params_index, dtype=int) if self._has_fixed_params else np.arange(len(self.form.names))
+        )
+
+    def _differenced(self) -> Floats:
+        """(T - d - D s, N) the series to fit; SettingError where there is too little of it."""
+        w = (
+            difference(self.endog, self.polynomial)
+            if self.nobs >= len(self.polynomial)
+            else np.zeros((0, self.k_endog))
+        )
+        used = int(np.isfinite(w[self.form.p :]).sum())
+        if used <= len(self._free):
+            raise SettingError(
+                f"endog: {used} values after differences and lags are too few for {len(self._free)} parameters;"
+                " give more rows or lower the order"
+            )
+        still = np.nanmax(w, axis=0, initial=-np.inf) <= np.nanmin(w, axis=0, initial=np.inf)
+        if still.all() or (still.any() and (self.form.heteroscedastic or self.form.mean)):
+            site = self.form.sites[int(np.argmax(still))]
+            raise SettingError(f"endog: series {site!r} does not vary after differences; leave it out")
+        return w
+
+    def _conditional_maximum(self, start: Floats | None, maxiter: int) -> Maximum:
+        """Over the free parameters, from full parameters or from a first guess."""
+        w, free = self._differenced(), self._free
+
+        def slopes(at: Floats) -> tuple[Floats, Floats]:
+            gradient, information = conditional.slopes(self.form, self.handle_params(at), w)
+            return gradient[free], information[np.ix_(free, free)]
+
+        def value(at: Floats) -> float:
+            with np.errstate(over="ignore", invalid="ignore"):
+                return conditional.loglike(self.form, self.handle_params(at), w)
+
+        begin = (conditional.first_guess(self.form, w) if start is None else start)[free]
+        return maximise(value, slopes, begin, maxiter)
+
+    def _exact_maximum(self, start: Floats, maxiter: int) -> Maximum:
+        w, free = self._differenced(), self._free
+
+        def slopes(at: Floats) -> tuple[Floats, Floats]:
+            _, information = conditional.slopes(self.form, self.handle_params(at), w)
+            gradient = self.score(
+                at, includes_fixed=False, method="approx", approx_complex_step=False, approx_centered=True
+            )
+            return np.asarray(gradient), information[np.ix_(free, free)]
+
+        def value(at: Floats) -> float:
+            try:
+                return float(self.loglike(at, includes_fixed=False))
+            except (SettingError, np.linalg.LinAlgError):
+                return -np.inf
+
+        return maximise(value, slopes, start, maxiter)
+
+    def _covariance(self, params: Floats) -> Floats:
+        """Of the estimates: the inverse information, NaN where a parameter is fixed."""
+        _, information = conditional.slopes(self.form, params, self._differenced())
+        covariance = np.full(information.shape, np.nan)
+        inside = np.ix_(self._free, self._free)
+        covariance[inside] = np.linalg.pinv(information[inside], hermitian=True)
+        return covariance
+
+    def simulate(self, params: Any, nsimulations: int, *args: Any, **kwargs: Any) -> Any:
+        """As statsmodels' own; from the start of the sample the levels of differenced series begin at 0."""
+        diffuse = self.ssm.initialization
+        self.ssm.initialization = self._initialization("known")
+        try:
+            return super().simulate(params, nsimulations, *args, **kwargs)
+        finally:
+            self.ssm.initialization = diffuse
+
+
+class STARIMAResults(MLEResults):  # type: ignore[misc]  # statsmodels ships no types
+    """A fitted STARIMA, or one filtered with given parameters; statsmodels' results with a few verbs more."""
+
+    def update(self, row: Any) -> STARIMAResults:
+        """Results that know one more row (N,), NaN where a value is missing, with the parameters as they were.
+
+        One step of the filter: cheap enough for every cycle. Forecasts start after the new row; what concerns the
+        sample, such as `resid` and `llf`, is about the new row alone (`append` keeps the whole sample).
+        """
+        values = np.asarray(row, dtype=np.float64).ravel()
+        if len(values) != self.model.k_endog:
+            raise SettingError(f"row: {len(values)} values for {self.model.k_endog} series; give one per series")
+        result: STARIMAResults = self.extend(values[None])
+        return result
+
+    def portmanteau(self, nlags: int = 10) -> space_time.Portmanteau:
+        """Test that the residuals are white in time and in space; they are scaled to one variance at all sites."""
+        form: Form = self.model.form
+        coefficients = form.names[form.parts[1].start : form.parts[2].stop]
+        fitted = sum(name not in self.fixed_params for name in coefficients)
+        return space_time.portmanteau(self._white(), form.weights, nlags, fitted)
+
+    def stacf(self, nlags: int = 10) -> Floats:
+        """(nlags, 1 + orders) space-time autocorrelations of the residuals."""
+        return space_time.stacf(self._white(), self.model.form.weights, nlags)
+
+    def _white(self) -> Floats:
+        """(T - burn, N) one-step errors over their standard deviations."""
+        return np.asarray(self.standardized_forecasts_error.T[self.loglikelihood_burn :])
+
+    def summary(self, alpha: float = 0.05, **kwargs: Any) -> Any:
+        """statsmodels' summary, with the space-time portmanteau test in place of its tests series by series."""
+        model = self.model
+        name = [f"STARIMA{model.order}"]
+        name += [f"seasonal differences {model.seasonal_diff}"] if model.seasonal_diff[0] else []
+        settings = {
+            "title": "STARIMA Results",
+            "model_name": name,
+            "display_diagnostics": False,
+            "display_max_endog": 3,
+        }
+        table = super().summary(alpha=alpha, **{**settings, **kwargs})
+        # Too few rows, as after `update`, have no test.
+        with contextlib.suppress(SettingError):
+            test = self.portmanteau()
+            table.extra_txt = (
+                f"Space-time portmanteau: {test.statistic:.2f}, df {test.df}, p {test.pvalue:.3f}\n\n{table.extra_txt}"
+            )
+        return table
+
+
+def _series(endog: Any) -> Any:
+    """As floats, a DataFrame or Series as such; SettingError where it is not (T, N) numbers or NaN."""
+    framed = isinstance(endog, pd.DataFrame | pd.Series)
+    try:
+        series = endog.astype(np.float64) if framed else np.asarray(endog, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SettingError(f"endog: {error}; give numbers, NaN where one is missing") from error
+    if series.ndim not in (1, 2) or not series.size:
+        raise SettingError(f"endog: shape {series.shape}; give (T, N), a row per step and a column per site")
+    if np.isinf(np.asarray(series)).any():
+        raise SettingError("endog: a value is infinite; give NaN where one is missing")
+    return series
+
+
+def _integers(name: str, given: Any, count: int) -> tuple[int, ...]:
+    """`given` as a tuple of so many integers, none negative."""
+    try:
+        numbers = tuple(int(number) for number in given)
+    except (TypeError, ValueError):
+        numbers = ()
+    if len(numbers) != count or min(numbers) < 0 or any(a != b for a, b in zip(numbers, given, strict=True)):
+        raise SettingError(f"{name}: {given!r} is not {count} integers of 0 or more")
+    return numbers
+
+
+def _terms(part: str, lags: int, spatial: int | Sequence[int], orders: int) -> tuple[Term, ...]:
+    """(time lag, spatial order) of each coefficient of one part of the model."""
+    each = [spatial] * lags if isinstance(spatial, int | np.integer) else list(spatial)
+    each = list(_integers(f"spatial, {part}", each, lags))
+    if max(each, default=0) > orders:
+        raise SettingError(
+            f"spatial: {part} order {max(each)} wants W_1 to W_{max(each)}; weights has {orders} of them beside W_0 = I"
+        )
+    return tuple((lag, order) for lag, most in enumerate(each, start=1) for order in range(most + 1))
