@@ -22,7 +22,7 @@ from utn_sumo.errors import SettingError, did_you_mean
 from utn_sumo.prediction import conditional, space_time
 from utn_sumo.prediction.form import Form, Term, difference, difference_polynomial
 from utn_sumo.prediction.scoring import Maximum, maximise
-from utn_sumo.prediction.weights import checked
+from utn_sumo.prediction.weights import Weights, checked
 
 METHODS = ("exact", "conditional")
 MOST_STATES = 3000
@@ -43,10 +43,10 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
     order               (p, d, q).
     spatial             (m, n): spatial orders of the autoregressive and of the moving average part, from 0 to m or n;
                         each an int for all time lags, or one int per time lag.
-    weights             W_1..W_k, or W_0..W_k with W_0 = I; each (N, N), its row z the weights of z's neighbours. Rows are
-                        divided by their sums; a site without neighbours has a row of zeros. See `network_weights`.
+    weights             W_1..W_k, or W_0..W_k with W_0 = I; each (N, N), its row z the weights of z's neighbours. Rows
+                        are divided by their sums; a site without neighbours has a row of zeros. See `network_weights`.
     seasonal_diff       (D, s): D differences at a season of s steps.
-    trend               "n": none, mu = 0. "c": a mean mu of each differenced series: its level, or its drift where d is 1.
+    trend               "n": none, mu = 0. "c": a mean mu of each differenced series: its level, or its drift if d = 1.
     heteroscedastic     each site has an innovation variance of its own, `sigma2.<series>`.
     enforce_stationarity, enforce_invertibility
                         refuse other parameters, and start from the stationary distribution; without the first all
@@ -67,7 +67,7 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         endog: Any,
         order: tuple[int, int, int] = (1, 0, 0),
         spatial: tuple[int | Sequence[int], int | Sequence[int]] = (0, 0),
-        weights: Sequence[Any] = (),
+        weights: Weights = (),
         *,
         seasonal_diff: tuple[int, int] = (0, 0),
         trend: Literal["n", "c"] = "n",
@@ -267,9 +267,8 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
     @property
     def _free(self) -> Any:
         """Places of the parameters that are not fixed."""
-        return (
-            np.array(self._free_params_index, dtype=int) if self._has_fixed_params else np.arange(len(self.form.names))
-        )
+        every = np.arange(len(self.form.names))
+        return every[self._free_params_index] if self._has_fixed_params else every
 
     def _differenced(self) -> Floats:
         """(T - d - D s, N) the series to fit; SettingError where there is too little of it."""
@@ -372,7 +371,7 @@ class STARIMAResults(MLEResults):  # type: ignore[misc]  # statsmodels ships no 
         return np.asarray(self.standardized_forecasts_error.T[self.loglikelihood_burn :])
 
     def summary(self, alpha: float = 0.05, **kwargs: Any) -> Any:
-        """statsmodels' summary, with the space-time portmanteau test in place of its tests series by series."""
+        """The summary of statsmodels, with the space-time portmanteau test in place of its tests series by series."""
         model = self.model
         name = [f"STARIMA{model.order}"]
         name += [f"seasonal differences {model.seasonal_diff}"] if model.seasonal_diff[0] else []
