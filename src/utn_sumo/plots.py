@@ -1,4 +1,7 @@
-"""Plots: how far a model is from its plant; what the links of a run held over time. The one door to matplotlib."""
+"""Plots: how far a model is from its plant; what the links of a run held over time; correlations in space and time.
+
+The one door to matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,14 @@ import numpy as np
 
 from utn_sumo.contract import Network
 from utn_sumo.mismatch import Errors, rmse
+from utn_sumo.prediction import stacf, stpacf
+from utn_sumo.prediction.weights import Weights
 from utn_sumo.recording import Log
 
 COLUMNS = 6
 INK, MODEL, PERSISTENCE, HISTORY, FLOOR = "#333333", "#0b6fa4", "#c8553d", "#b08900", "#6b8e23"
+ORDERS = (MODEL, PERSISTENCE, HISTORY, FLOOR)
+LAG_TICKS = 25
 
 
 def mismatch(result: dict[str, Any], network: Network, found: Errors, folder: Path) -> None:
@@ -118,6 +125,36 @@ def trajectories(network: Network, log: Log, title: str, path: Path) -> None:
     figure.suptitle(title, y=0.975)
     figure.supxlabel("time (h)", fontsize=10)
     figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def space_time_correlations(z: Any, weights: Weights, nlags: int, path: Path, title: str = "") -> None:
+    """Write a PNG of the STACF and STPACF of z (T, N): the orders that a STARIMA of it needs, or its residuals miss.
+
+    A stem per spatial order at each time lag. Within the grey band lie 95 % of white noise's, but for its STPACF of
+    spatial orders above 0, which spread wider: sums over many neighbours vary little, so their coefficients vary more.
+    """
+    plt = _pyplot()
+    lags = np.arange(1, nlags + 1)
+    rows, sites = np.shape(z)
+    spread = 1.96 / np.sqrt(sites * (rows - lags))
+    ends, band = np.r_[0.5, lags, nlags + 0.5], np.r_[spread[0], spread, spread[-1]]
+    figure, pair = plt.subplots(2, 1, figsize=(7.2, 5.6), sharex=True, sharey=True, layout="constrained")
+    for axes, name, found in zip(pair, ("STACF", "STPACF"), (stacf, stpacf), strict=True):
+        values = found(z, weights, nlags).T
+        axes.fill_between(ends, -band, band, color=INK, alpha=0.15, linewidth=0)
+        axes.axhline(0, color=INK, linewidth=0.6)
+        shifts = (np.arange(len(values)) - (len(values) - 1) / 2) * 0.7 / max(len(values), 2)
+        for order, (shift, heights) in enumerate(zip(shifts, values, strict=True)):
+            color = ORDERS[order % len(ORDERS)]
+            axes.vlines(lags + shift, 0, heights, color=color, linewidth=2)
+            axes.plot(lags + shift, heights, "o", color=color, markersize=4, label=f"spatial order {order}")
+        axes.set(ylabel=name, xlim=(0.5, nlags + 0.5))
+        axes.grid(visible=True, axis="y", linewidth=0.3)
+    pair[0].legend(frameon=False, ncols=3, fontsize=9)
+    pair[1].set(xlabel="time lag (steps)", xticks=lags[:: -(-nlags // LAG_TICKS)])
+    figure.suptitle(title)
+    figure.savefig(path, dpi=130)
     plt.close(figure)
 
 

@@ -230,10 +230,11 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
     ) -> STARIMAResults:
         """Estimate the parameters.
 
-        `exact` climbs the Kalman filter's likelihood by scoring, from the conditional estimates. `conditional` takes the
-        first p rows as given and what was before as the mean: least squares where there is no MA part. It filters only
-        once, and is the one for many sites, or for a hundred with means or variances of their own. Standard errors
-        come from the information of the conditional likelihood, or by statsmodels' own `cov_type`.
+        `exact` climbs the Kalman filter's likelihood by scoring, from the conditional estimates: half a second for 17
+        sites and 480 rows, seconds for 94 sites and 100 rows, minutes for these with means or variances of their own.
+        `conditional` takes the first p rows as given and what was before as the mean (least squares where there is no
+        MA part), and filters only once: under a second for all of these. Standard errors come from the information of
+        the conditional likelihood, or by statsmodels' own `cov_type`.
         """
         if method not in METHODS:
             raise SettingError(f"method: {method!r} is unknown; {did_you_mean(method, METHODS)}")
@@ -411,7 +412,7 @@ def _integers(name: str, given: Any, count: int) -> tuple[int, ...]:
         numbers = tuple(int(number) for number in given)
     except (TypeError, ValueError):
         numbers = ()
-    if len(numbers) != count or min(numbers) < 0 or any(a != b for a, b in zip(numbers, given, strict=True)):
+    if len(numbers) != count or min(numbers, default=0) < 0 or numbers != tuple(given):
         raise SettingError(f"{name}: {given!r} is not {count} integers of 0 or more")
     return numbers
 
