@@ -71,9 +71,9 @@ def slopes(form: Form, params: Floats, w: Floats) -> tuple[Floats, Floats]:
     if not form.heteroscedastic:
         by_variance, of_variance = by_variance.sum(keepdims=True), of_variance.sum(keepdims=True)
     gradient = -np.einsum("tkn,tn->k", de, np.nan_to_num(e) / variance)
-    scaled = (de / np.sqrt(variance)).transpose(1, 0, 2).reshape(de.shape[1], -1)
+    scaled = (de / np.sqrt(variance)).transpose(1, 0, 2)
     information = np.zeros((len(params), len(params)))
-    information[: len(gradient), : len(gradient)] = scaled @ scaled.T
+    information[: len(gradient), : len(gradient)] = np.tensordot(scaled, scaled, axes=((1, 2), (1, 2)))
     information[len(gradient) :, len(gradient) :] = np.diag(of_variance)
     return np.concatenate([gradient, by_variance]), information
 

@@ -11,6 +11,8 @@ from utn_sumo.contract import Floats
 
 GAIN = 1e-8
 """A step that promises to raise the log-likelihood by less than this ends the search: 1e-4 standard errors."""
+ROUNDING = 1e-4
+"""Nor need it promise more where no step raises it: diffuse levels can cost the log-likelihood that many digits."""
 HALVINGS = 30
 
 
@@ -48,4 +50,4 @@ def maximise(
         else:
             break
         at, level = at + step, reached
-    return Maximum(at, level, iteration, not len(at) or promised < 100 * GAIN)
+    return Maximum(at, level, iteration, not len(at) or promised < ROUNDING)

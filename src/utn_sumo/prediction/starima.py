@@ -120,7 +120,7 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         names = [str(name) for name in np.atleast_1d(self.endog_names)]
         self.form = Form(ar, ma, matrices, tuple(names), trend == "c", heteroscedastic)
         self._lay_out(sites, span)
-        self.ssm.initialization = self._initialization("approximate_diffuse")
+        self._beginning = self.ssm.initialization = self._initialization("approximate_diffuse")
         if "loglikelihood_burn" not in kwargs:
             self.loglikelihood_burn = span + (0 if enforce_stationarity else self._blocks)
 
@@ -332,13 +332,14 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         return covariance
 
     def simulate(self, params: Any, nsimulations: int, *args: Any, **kwargs: Any) -> Any:
-        """As statsmodels' own; from the start of the sample the levels of differenced series begin at 0."""
-        diffuse = self.ssm.initialization
-        self.ssm.initialization = self._initialization("known")
+        """As statsmodels' own; from the start of the sample, diffuse levels of differenced series begin at 0."""
+        beginning = self.ssm.initialization
+        if beginning is self._beginning:
+            self.ssm.initialization = self._initialization("known")
         try:
             return super().simulate(params, nsimulations, *args, **kwargs)
         finally:
-            self.ssm.initialization = diffuse
+            self.ssm.initialization = beginning
 
 
 class STARIMAResults(MLEResults):  # type: ignore[misc]  # statsmodels ships no types
@@ -355,6 +356,12 @@ class STARIMAResults(MLEResults):  # type: ignore[misc]  # statsmodels ships no 
             raise SettingError(f"row: {len(values)} values for {self.model.k_endog} series; give one per series")
         result: STARIMAResults = self.extend(values[None])
         return result
+
+    def simulate(self, nsimulations: int, *, anchor: Any = None, initial_state: Any = None, **kwargs: Any) -> Any:
+        """As statsmodels' own: from the `anchor` "start", as `STARIMA.simulate`, or "end", on from the sample."""
+        if anchor in (None, "start", 0) and initial_state is None:
+            return self.model.simulate(self.params, nsimulations, includes_fixed=True, **kwargs)
+        return super().simulate(nsimulations, anchor=anchor, initial_state=initial_state, **kwargs)
 
     def portmanteau(self, nlags: int = 10) -> space_time.Portmanteau:
         """Test that the residuals are white in time and in space; they are scaled to one variance at all sites."""
@@ -413,14 +420,13 @@ def _integers(name: str, given: Any, count: int) -> tuple[int, ...]:
     except (TypeError, ValueError):
         numbers = ()
     if len(numbers) != count or min(numbers, default=0) < 0 or numbers != tuple(given):
-        raise SettingError(f"{name}: {given!r} is not {count} integers of 0 or more")
+        raise SettingError(f"{name}: {given!r} is not {count} integer{'s' * (count != 1)} of 0 or more")
     return numbers
 
 
 def _terms(part: str, lags: int, spatial: int | Sequence[int], orders: int) -> tuple[Term, ...]:
     """(time lag, spatial order) of each coefficient of one part of the model."""
-    each = [spatial] * lags if isinstance(spatial, int | np.integer) else list(spatial)
-    each = list(_integers(f"spatial, {part}", each, lags))
+    each = _integers(f"spatial, {part}", (spatial,) * lags if isinstance(spatial, int | np.integer) else spatial, lags)
     if max(each, default=0) > orders:
         raise SettingError(
             f"spatial: {part} order {max(each)} wants W_1 to W_{max(each)}; weights has {orders} of them beside W_0 = I"
