@@ -69,22 +69,22 @@ def test_every_public_name_is_there_and_no_other() -> None:
 
 @pytest.mark.parametrize("gaps", [False, True])
 @pytest.mark.parametrize(
-    ("order", "seasonal", "params", "settings"),
+    ("order", "params", "settings"),
     [
-        ((2, 0, 1), (0, 0), [0.5, 0.2, 0.4, 1.1], {}),
-        ((0, 0, 2), (0, 0), [0.3, 0.2, 0.9], {}),
-        ((1, 1, 1), (0, 0), [0.5, -0.4, 1.2], {}),
-        ((0, 1, 0), (0, 0), [1.2], {}),
-        ((1, 0, 0), (1, 4), [0.3, 1.0], {}),
-        ((2, 0, 1), (0, 0), [0.5, 0.2, 0.4, 1.1], {"enforce_stationarity": False}),
+        ((2, 0, 1), [0.5, 0.2, 0.4, 1.1], {}),
+        ((0, 0, 2), [0.3, 0.2, 0.9], {}),
+        ((1, 1, 1), [0.5, -0.4, 1.2], {}),
+        ((0, 1, 0), [1.2], {}),
+        ((1, 0, 0), [0.3, 1.0], {"seasonal_diff": (1, 4)}),
+        ((2, 0, 1), [0.5, 0.2, 0.4, 1.1], {"enforce_stationarity": False}),
     ],
 )
-def test_one_site_is_sarimax(
-    series: Floats, gaps: bool, order: Any, seasonal: Any, params: list[float], settings: Any
-) -> None:
+def test_one_site_is_sarimax(series: Floats, gaps: bool, order: Any, params: list[float], settings: Any) -> None:
     z = with_gaps(series[:, :1], 2)[:, 0] if gaps else series[:, 0]
-    ours = STARIMA(z, order, seasonal_diff=seasonal, **settings).filter(params)
-    theirs = SARIMAX(z, order=order, seasonal_order=(0, seasonal[0], 0, seasonal[1]), **settings).filter(params)
+    ours = STARIMA(z, order, **settings).filter(params)
+    others = dict(settings)
+    times, period = others.pop("seasonal_diff", (0, 0))
+    theirs = SARIMAX(z, order=order, seasonal_order=(0, times, 0, period), **others).filter(params)
     assert ours.llf == pytest.approx(theirs.llf, abs=1e-6)
     assert ours.aic == pytest.approx(theirs.aic, abs=1e-6)
     mine, other = ours.get_forecast(6), theirs.get_forecast(6)

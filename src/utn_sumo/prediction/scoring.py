@@ -36,6 +36,8 @@ def maximise(
     at, level, iteration, promised = start, value(start), 0, np.inf
     while iteration < maxiter and len(at):
         gradient, information = slopes(at)
+        if not np.isfinite(gradient).all():
+            break  # at the edge of what is admissible
         scale = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
         step = scale * np.linalg.lstsq(information * np.outer(scale, scale), gradient * scale, rcond=1e-10)[0]
         promised = float(gradient @ step) / 2

@@ -26,6 +26,8 @@ from utn_sumo.prediction.weights import Weights, checked
 
 METHODS = ("exact", "conditional")
 MOST_STATES = 3000
+STEP = 1e-3
+"""Of the differences that give the slope of the exact likelihood, in standard errors."""
 COVARIANCE = "Covariance matrix calculated from the information of the conditional likelihood."
 
 
@@ -308,18 +310,19 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
     def _exact_maximum(self, start: Floats, maxiter: int) -> Maximum:
         w, free = self._differenced(), self._free
 
-        def slopes(at: Floats) -> tuple[Floats, Floats]:
-            _, information = conditional.slopes(self.form, self.handle_params(at), w)
-            gradient = self.score(
-                at, includes_fixed=False, method="approx", approx_complex_step=False, approx_centered=True
-            )
-            return np.asarray(gradient), information[np.ix_(free, free)]
-
         def value(at: Floats) -> float:
             try:
                 return float(self.loglike(at, includes_fixed=False))
             except (SettingError, np.linalg.LinAlgError):
                 return -np.inf
+
+        def slopes(at: Floats) -> tuple[Floats, Floats]:
+            _, information = conditional.slopes(self.form, self.handle_params(at), w)
+            information = information[np.ix_(free, free)]
+            # Steps in standard errors: diffuse levels can cost the log-likelihood more digits than smaller steps bear.
+            steps = STEP / np.sqrt(np.diag(information))
+            rises = [value(at + aside) - value(at - aside) for aside in np.diag(steps)]
+            return np.array(rises) / (2 * steps), information
 
         return maximise(value, slopes, start, maxiter)
 
