@@ -5,8 +5,9 @@
     python tools/bench.py traffic      controllers against each other over demands and seeds
     python tools/bench.py step         the model's step: what a finer one costs and brings, in prediction and in control
     python tools/bench.py estimate     vehicles estimated from loops that miscount: counting against the filter
+    python tools/bench.py forecast     STARIMA: time to fit, and to update and forecast each cycle
 
-Each prints a table, or with --json one object (all but overhead: a list of objects).
+Each prints a table, or with --json one object (traffic, step and estimate: a list of objects).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import forecasting
 import solving
 from utn_sumo import bridge, calibration, mismatch, network, recording, replay, sumo_tools
 from utn_sumo.contract import Measurement
@@ -267,6 +269,24 @@ def estimate(net: str, hours: float, demands: str, errors: str, seed: int, as_js
             [f"{r['demand']:g}", f"{r['loop_error']:g}", f"{r['counting_rmse_veh']:.2f}", f"{r['filter_rmse_veh']:.2f}"]
             for r in rows
         ],
+    )
+
+
+@bench.command()
+@click.option("--net", default="utn17", show_default=True)
+@click.option("--rows", default=480, show_default=True, help="Steps of the series that are fitted.")
+@click.option("--repeats", default=5, show_default=True)
+@click.option("--json", "as_json", is_flag=True)
+def forecast(net: str, rows: int, repeats: int, as_json: bool) -> None:
+    """STARIMA (2,0,1), spatial order 1, a series per link: time to fit; to update and forecast 7 steps."""
+    found = forecasting.measure(net, rows, repeats)
+    if as_json:
+        click.echo(json.dumps(found))
+        return
+    _show(
+        f"{net}, STARIMA of {found['series']} series: median of {repeats}",
+        ["figure", "value"],
+        [[key, _text(value)] for key, value in found.items()],
     )
 
 

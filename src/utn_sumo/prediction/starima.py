@@ -26,6 +26,7 @@ from utn_sumo.prediction.weights import Weights, checked
 
 METHODS = ("exact", "conditional")
 MOST_STATES = 3000
+SMALL = 1e-3
 STEP = 1e-3
 """Of the differences that give the slope of the exact likelihood, in standard errors."""
 COVARIANCE = "Covariance matrix calculated from the information of the conditional likelihood."
@@ -58,7 +59,8 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
 
     Differences are taken inside the state space, which keeps the levels of the last d + D s rows: they are integrated
     back with the right variances, and a missing value costs one value, not every difference it is part of. As in
-    SARIMAX these states start approximately diffuse and the first d + D s rows do not count in the likelihood.
+    SARIMAX these states start approximately diffuse, with an `initial_variance` of 1e6 (times the variance of the
+    differences where that is beyond 1e-3 to 1e3), and the first d + D s rows do not count in the likelihood.
     There are N (max(p, q + 1) + d + D s) states: rather than differencing at a long season subtract its mean profile.
 
     Further keywords go to `MLEModel`. Raises SettingError for whatever is out of range.
@@ -122,6 +124,8 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         names = [str(name) for name in np.atleast_1d(self.endog_names)]
         self.form = Form(ar, ma, matrices, tuple(names), trend == "c", heteroscedastic)
         self._lay_out(sites, span)
+        if "initial_variance" not in kwargs:
+            self.ssm.initial_variance *= _unit(difference(self.endog, self.polynomial))
         self._beginning = self.ssm.initialization = self._initialization("approximate_diffuse")
         if "loglikelihood_burn" not in kwargs:
             self.loglikelihood_burn = span + (0 if enforce_stationarity else self._blocks)
@@ -414,6 +418,14 @@ def _series(endog: Any) -> Any:
     if np.isinf(np.asarray(series)).any():
         raise SettingError("endog: a value is infinite; give NaN where one is missing")
     return series
+
+
+def _unit(differences: Floats) -> float:
+    """What to measure a diffuse variance in: 1, or the variance of the differences if that is of another order."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        variance = float(np.nanvar(differences))
+    return 1.0 if not variance > 0 or SMALL < variance < 1 / SMALL else variance
 
 
 def _integers(name: str, given: Any, count: int) -> tuple[int, ...]:
