@@ -214,8 +214,18 @@ def test_means_and_variances_of_the_sites_are_recovered() -> None:
     assert np.abs(off).max() < 3
 
 
-def test_the_exact_estimates_are_at_a_maximum(series: Floats) -> None:
-    model = STARIMA(with_gaps(series, 8), (1, 0, 1), (1, 1), [WEIGHTS])
+@pytest.mark.parametrize("d", [0, 1])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"trend": "c", "heteroscedastic": True},
+        {"trend": "c", "heteroscedastic": True, "enforce_stationarity": False},
+    ],
+)
+def test_the_exact_estimates_are_at_a_maximum(series: Floats, d: int, settings: dict[str, Any]) -> None:
+    z = with_gaps(series.cumsum(axis=0) if d else series, 8)
+    model = STARIMA(z, (1, d, 1), (1, 1), [WEIGHTS], **settings)
     results = model.fit()
     assert results.mle_retvals["converged"]
     assert results.llf >= model.fit(method="conditional").llf
@@ -224,6 +234,16 @@ def test_the_exact_estimates_are_at_a_maximum(series: Floats) -> None:
             aside = results.params.copy()
             aside[place] += sign * 0.05 * error
             assert model.loglike(aside) < results.llf
+
+
+@pytest.mark.parametrize("d", [0, 1])
+def test_slopes_by_smoothing_are_those_of_the_likelihood(series: Floats, d: int) -> None:
+    model = STARIMA(with_gaps(series, 16), (2, d, 1), (1, 1), [WEIGHTS], trend="c", heteroscedastic=True)
+    at = np.array([*np.linspace(-1, 1, 6), 0.4, 0.2, 0.1, 0.1, 0.0, -0.3, *np.linspace(0.5, 2, 6)])
+    found = model._slopes_by_smoothing(at)
+    stepped = [(model.loglike(at + aside) - model.loglike(at - aside)) / 2e-4 for aside in 1e-4 * np.eye(len(at))]
+    assert np.isnan(found[6:12]).all()
+    assert np.delete(found, range(6, 12)) == pytest.approx(np.delete(stepped, range(6, 12)), abs=1e-4)
 
 
 def test_standard_errors_of_statsmodels_are_to_be_had_and_nearly_the_same(series: Floats) -> None:
