@@ -165,6 +165,21 @@ def test_star_by_least_squares_is_least_squares() -> None:
     assert results.bse[:4] == pytest.approx(np.sqrt(variance * np.diag(np.linalg.inv(matrix.T @ matrix))))
 
 
+def test_least_squares_need_not_be_stationary_where_that_is_not_asked() -> None:
+    z = np.exp(0.02 * np.arange(120))[:, None] * [1.0, 2.0, 3.0] + np.random.default_rng(18).normal(size=(120, 3))
+    expected = (z[:-1] * z[1:]).sum() / (z[:-1] ** 2).sum()
+    assert expected > 1
+    free = STARIMA(z, (1, 0, 0), enforce_stationarity=False).fit(method="conditional")
+    assert free.params[0] == pytest.approx(expected)
+    with pytest.warns(ConvergenceWarning):
+        assert STARIMA(z, (1, 0, 0)).fit().params[0] < 1
+
+
+def test_a_fixed_coefficient_that_is_inadmissible_is_refused(series: Floats) -> None:
+    with pytest.raises(SettingError, match="AR coefficients are not stationary"):
+        STARIMA(series, (1, 0, 0)).fit_constrained({"ar.L1.S0": 1.1})
+
+
 REFERENCE = {"ar.L1.S0": (0.4, 0.0075), "ar.L1.S1": (0.25, 0.025), "ar.L2.S0": (0.25, 0.007), "ma.L1.S1": (-0.3, 0.033)}
 """Coefficients of the reference simulation, and their deviations."""
 
@@ -348,6 +363,15 @@ def test_update_append_and_filtering_anew_are_the_same(
         assert updated.forecast(2).index[0] == pd.Timestamp("2024-01-01 04:00")
 
 
+@pytest.mark.parametrize("d", [0, 1])
+def test_the_likelihood_of_what_came_later_adds_up(series: Floats, d: int) -> None:
+    z = with_gaps(series, 17)
+    model = STARIMA(z[:110], (1, d, 1), (1, 1), [WEIGHTS])
+    begun = model.filter([0.4, 0.3, 0.2, 0.2, 1.0])
+    later = begun.update(z[110]).llf + begun.update(z[110]).extend(z[111:]).llf
+    assert begun.llf + later == pytest.approx(begun.append(z[110:]).llf)
+
+
 def test_a_row_of_nothing_only_moves_time_on(series: Floats) -> None:
     results = STARIMA(series, (1, 1, 1), (1, 1), [WEIGHTS]).filter([0.4, 0.3, 0.2, 0.2, 1.0])
     blind = results.update(np.full(6, np.nan))
@@ -425,6 +449,8 @@ ROWS = np.random.default_rng(15).normal(size=(30, 3))
         (ROWS, {"trend": "ct"}, "trend: 'ct' is unknown"),
         (ROWS * np.inf, {}, "endog: a value is infinite"),
         ([["a", "b"]], {}, "endog: could not convert string to float: 'a'; give numbers"),
+        (pd.DataFrame(ROWS, index=np.arange(30) ** 2), {}, "endog: the steps of its index are not regular"),
+        (pd.DataFrame(ROWS, index=pd.to_datetime(np.arange(30) ** 2)), {}, "endog: the steps of its index are not"),
         (ROWS[None], {}, r"endog: shape \(1, 30, 3\); give \(T, N\)"),
     ],
 )

@@ -11,8 +11,6 @@ import numpy as np
 from utn_sumo.contract import Floats
 from utn_sumo.prediction.form import Form, Term
 
-SHRINK = 0.9
-
 
 def innovations(form: Form, params: Floats, w: Floats) -> tuple[Floats, Floats]:
     """Innovations (T - p, N) of w (T, N), NaN where w is; their derivatives (T - p, k, N) by mean, ar and ma."""
@@ -52,9 +50,9 @@ def innovations(form: Form, params: Floats, w: Floats) -> tuple[Floats, Floats]:
 
 
 def loglike(form: Form, params: Floats, w: Floats) -> float:
-    """The Gaussian log-likelihood of the innovations; -inf where the parameters are inadmissible."""
+    """The Gaussian log-likelihood of the innovations; -inf where they can't be reckoned one after the other."""
     variance = form.variance_of(params)
-    if (variance <= 0).any() or max(form.ar_root(params), form.ma_root(params)) >= 1:
+    if (variance <= 0).any() or form.ma_root(params) >= 1:
         return -np.inf
     e, _ = innovations(form, params, w)
     terms = np.log(2 * np.pi * variance) + e**2 / variance
@@ -81,7 +79,7 @@ def slopes(form: Form, params: Floats, w: Floats) -> tuple[Floats, Floats]:
 def first_guess(form: Form, w: Floats) -> Floats:
     """Hannan and Rissanen's: innovations from a long autoregression, then least squares on them and the series.
 
-    Where that is not stationary or not invertible it is shrunk until it is.
+    It need be neither stationary nor invertible.
     """
     mean = np.nanmean(w, axis=0) if form.mean else np.zeros(len(form.sites))
     z = np.nan_to_num(w - mean)
@@ -93,11 +91,7 @@ def first_guess(form: Form, w: Floats) -> Floats:
     coefficients, rest = _regress(form, z, [(z, form.ar), (e, form.ma)])
     squares = np.where(np.isnan(w), np.nan, rest) ** 2
     variance = np.nanmean(squares, axis=0) if form.heteroscedastic else np.nanmean(squares, keepdims=True)[0]
-    params = np.concatenate([mean if form.mean else [], coefficients, np.maximum(variance, np.finfo(float).tiny)])
-    for part, root in ((form.parts[1], form.ar_root), (form.parts[2], form.ma_root)):
-        while root(params) >= 1:
-            params[part] *= SHRINK
-    return params
+    return np.concatenate([mean if form.mean else [], coefficients, np.maximum(variance, np.finfo(float).tiny)])
 
 
 def _regress(form: Form, z: Floats, terms: list[tuple[Floats, list[Term] | tuple[Term, ...]]]) -> tuple[Floats, Floats]:

@@ -107,8 +107,8 @@ def _largest_root(matrices: Floats) -> float:
 
 def difference(z: Floats, polynomial: Ints) -> Floats:
     """(T - K, N) of z (T, N): sum_j polynomial_j z_{t-j}, where the polynomial has K + 1 coefficients."""
-    span = len(polynomial) - 1
-    return np.asarray(sum(c * z[span - j : len(z) - j] for j, c in enumerate(polynomial)))
+    span, rows = len(polynomial) - 1, max(0, len(z) - len(polynomial) + 1)
+    return np.asarray(sum(c * z[span - j : span - j + rows] for j, c in enumerate(polynomial)))
 
 
 def difference_polynomial(d: int, seasonal: tuple[int, int]) -> Ints:

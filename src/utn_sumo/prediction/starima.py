@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 from scipy.linalg import solve_discrete_lyapunov
-from statsmodels.tools.sm_exceptions import ConvergenceWarning
+from statsmodels.tools.sm_exceptions import ConvergenceWarning, ValueWarning
 from statsmodels.tsa.statespace.initialization import Initialization
 from statsmodels.tsa.statespace.kalman_smoother import SMOOTHER_DISTURBANCE, SMOOTHER_DISTURBANCE_COV
 from statsmodels.tsa.statespace.mlemodel import MLEModel, MLEResults, MLEResultsWrapper
@@ -29,6 +29,8 @@ from utn_sumo.prediction.weights import Weights, checked
 METHODS = ("exact", "conditional")
 MOST_STATES = 3000
 SMALL = 1e-3
+SHRINK, SHRINKINGS = 0.9, 100
+"""Of the coefficients of a first guess, until it is admissible."""
 STEP = 1e-3
 """Of the differences that give the slope of the exact likelihood, in standard errors."""
 COVARIANCE = "Covariance matrix calculated from the information of the conditional likelihood."
@@ -122,7 +124,14 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
                 f"STARIMA: {states} states are more than {MOST_STATES}; subtract the mean profile of a long season"
                 " rather than differencing at it, or take fewer series"
             )
-        super().__init__(series, k_states=states, k_posdef=sites, **kwargs)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ValueWarning)  # of the index: what is wrong with it is an error here
+            super().__init__(series, k_states=states, k_posdef=sites, **kwargs)
+        if self._index_generated and not self._index_none:
+            raise SettingError(
+                "endog: the steps of its index are not regular; give dates of one frequency with missing rows as NaN,"
+                " whole numbers that follow one another, or an array"
+            )
         names = [str(name) for name in np.atleast_1d(self.endog_names)]
         self.form = Form(ar, ma, matrices, tuple(names), trend == "c", heteroscedastic)
         self._lay_out(sites, span)
@@ -281,11 +290,7 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
 
     def _differenced(self) -> Floats:
         """(T - d - D s, N) the series to fit; SettingError where there is too little of it."""
-        w = (
-            difference(self.endog, self.polynomial)
-            if self.nobs >= len(self.polynomial)
-            else np.zeros((0, self.k_endog))
-        )
+        w = difference(self.endog, self.polynomial)
         used = int(np.isfinite(w[self.form.p :]).sum())
         if used <= len(self._free):
             raise SettingError(
@@ -307,10 +312,20 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
             return gradient[free], information[np.ix_(free, free)]
 
         def value(at: Floats) -> float:
-            with np.errstate(over="ignore", invalid="ignore"):
-                return conditional.loglike(self.form, self.handle_params(at), w)
+            params = self.handle_params(at)
+            try:
+                self._admit(params)
+            except SettingError:
+                return -np.inf
+            return conditional.loglike(self.form, params, w)
 
         begin = (conditional.first_guess(self.form, w) if start is None else start)[free]
+        coefficients = (free >= self.form.parts[1].start) & (free < self.form.parts[2].stop)
+        for _ in range(SHRINKINGS if start is None else 0):
+            if np.isfinite(value(begin)):
+                break
+            begin[coefficients] *= SHRINK
+        self._admit(self.handle_params(begin))
         return maximise(value, slopes, begin, maxiter)
 
     def _exact_maximum(self, start: Floats, maxiter: int) -> Maximum:
@@ -390,13 +405,18 @@ class STARIMAResults(MLEResults):  # type: ignore[misc]  # statsmodels ships no 
         """Results that know one more row (N,), NaN where a value is missing, with the parameters as they were.
 
         One step of the filter: cheap enough for every cycle. Forecasts start after the new row; what concerns the
-        sample, such as `resid` and `llf`, is about the new row alone (`append` keeps the whole sample).
+        sample, such as `resid` and `llf`, is about the new row alone. To keep or refit the whole sample, `append` all
+        new rows to the fitted results.
         """
         values = np.asarray(row, dtype=np.float64).ravel()
         if len(values) != self.model.k_endog:
             raise SettingError(f"row: {len(values)} values for {self.model.k_endog} series; give one per series")
         result: STARIMAResults = self.extend(values[None])
         return result
+
+    def extend(self, endog: Any, exog: Any = None, fit_kwargs: Any = None, **kwargs: Any) -> Any:
+        """As statsmodels' own; all new rows count in the likelihood, since the levels before them are known."""
+        return super().extend(endog, exog, fit_kwargs, **{"loglikelihood_burn": 0, **kwargs})
 
     def simulate(self, nsimulations: int, *, anchor: Any = None, initial_state: Any = None, **kwargs: Any) -> Any:
         """As statsmodels' own: from the `anchor` "start", as `STARIMA.simulate`, or "end", on from the sample."""
