@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -502,3 +503,12 @@ def test_other_unhappy_askings_are_one_line() -> None:
         model.clone(ROWS, exog=ROWS)
     with pytest.raises(SettingError, match="criterion: 'mic' is unknown"):
         select_order(ROWS, [LINE], criterion="mic")
+
+
+def test_the_guide_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    guide = (Path(__file__).parents[2] / "docs" / "starima.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    exec(guide.split("```python\n")[1].split("```")[0], names)
+    assert names["found"].order == (1, 0, 1)
+    assert names["ahead"].predicted_mean.shape == (7, 17)
+    assert "mean.y17" in capsys.readouterr().out
