@@ -24,8 +24,9 @@ from utn_sumo.prediction.space_time import Portmanteau, portmanteau, stacf, stpa
 from utn_sumo.prediction.weights import network_weights
 
 if TYPE_CHECKING:
+    from utn_sumo.prediction.results import STARIMAResults
     from utn_sumo.prediction.selection import OrderSelection, select_order
-    from utn_sumo.prediction.starima import STARIMA, STARIMAResults
+    from utn_sumo.prediction.starima import STARIMA
 
 __all__ = [
     "STARIMA",
@@ -42,7 +43,7 @@ __all__ = [
 
 _ON_STATSMODELS = {
     "STARIMA": "starima",
-    "STARIMAResults": "starima",
+    "STARIMAResults": "results",
     "OrderSelection": "selection",
     "select_order": "selection",
 }

@@ -97,8 +97,10 @@ def _largest_root(matrices: Floats) -> float:
     if not len(matrices):
         return 0.0
     bound = float(np.abs(matrices).sum(axis=(0, 2)).max())
-    if bound < 1 or not np.isfinite(bound):
-        return bound if bound < 1 else np.inf
+    if not np.isfinite(bound):
+        return np.inf
+    if bound < 1:
+        return bound
     size = matrices.shape[1]
     companion = np.eye(len(matrices) * size, k=-size)
     companion[:size] = np.concatenate([*matrices], axis=1)

@@ -6,29 +6,27 @@ intervals, everything that statsmodels' own results can do.
 
 from __future__ import annotations
 
-import contextlib
 import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
-import pandas as pd
 from scipy.linalg import solve_discrete_lyapunov
 from statsmodels.tools.sm_exceptions import ConvergenceWarning, ValueWarning
 from statsmodels.tsa.statespace.initialization import Initialization
 from statsmodels.tsa.statespace.kalman_smoother import SMOOTHER_DISTURBANCE, SMOOTHER_DISTURBANCE_COV
-from statsmodels.tsa.statespace.mlemodel import MLEModel, MLEResults, MLEResultsWrapper
+from statsmodels.tsa.statespace.mlemodel import MLEModel, MLEResultsWrapper
 
 from utn_sumo.contract import Floats
 from utn_sumo.errors import SettingError, did_you_mean
-from utn_sumo.prediction import conditional, space_time
-from utn_sumo.prediction.form import Form, Term, difference, difference_polynomial
+from utn_sumo.prediction import conditional, inputs
+from utn_sumo.prediction.form import Form, difference, difference_polynomial
+from utn_sumo.prediction.results import STARIMAResults
 from utn_sumo.prediction.scoring import Maximum, maximise
 from utn_sumo.prediction.weights import Weights, checked
 
 METHODS = ("exact", "conditional")
 MOST_STATES = 3000
-SMALL = 1e-3
 SHRINK, SHRINKINGS = 0.9, 100
 """Of the coefficients of a first guess, until it is admissible."""
 STEP = 1e-3
@@ -84,7 +82,7 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         enforce_invertibility: bool = True,
         **kwargs: Any,
     ):
-        series = _series(endog)
+        series = inputs.series(endog)
         sites = 1 if series.ndim == 1 else series.shape[1]
         self._settings = {
             "order": order,
@@ -99,8 +97,8 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         }
         if trend not in ("n", "c"):
             raise SettingError(f'trend: {trend!r} is unknown; give "n" for none or "c" for a mean of each series')
-        p, d, q = _integers("order", order, 3)
-        times, period = _integers("seasonal_diff", seasonal_diff, 2)
+        p, d, q = inputs.integers("order", order, 3)
+        times, period = inputs.integers("seasonal_diff", seasonal_diff, 2)
         if times and not period:
             raise SettingError(
                 f"seasonal_diff: {times} differences at a season of {period}; a season has 1 step or more"
@@ -110,8 +108,8 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
             raise SettingError(
                 f"spatial: {spatial!r} is no pair; give (m, n), the spatial orders of the AR and MA parts"
             )
-        ar = _terms("AR", p, spatial[0], len(matrices) - 1)
-        ma = _terms("MA", q, spatial[1], len(matrices) - 1)
+        ar = inputs.terms("AR", p, spatial[0], len(matrices) - 1)
+        ma = inputs.terms("MA", q, spatial[1], len(matrices) - 1)
         self.order, self.seasonal_diff = (p, d, q), (times, period)
         self.enforce_stationarity, self.enforce_invertibility = enforce_stationarity, enforce_invertibility
         self.polynomial = difference_polynomial(d, (times, period))
@@ -136,7 +134,7 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         self.form = Form(ar, ma, matrices, tuple(names), trend == "c", heteroscedastic)
         self._lay_out(sites, span)
         if "initial_variance" not in kwargs:
-            self.ssm.initial_variance *= _unit(difference(self.endog, self.polynomial))
+            self.ssm.initial_variance *= inputs.unit(difference(self.endog, self.polynomial))
         self._beginning = self.ssm.initialization = self._initialization("approximate_diffuse")
         if "loglikelihood_burn" not in kwargs:
             self.loglikelihood_burn = span + (0 if enforce_stationarity else self._blocks)
@@ -396,108 +394,3 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
             return super().simulate(params, nsimulations, *args, **kwargs)
         finally:
             self.ssm.initialization = beginning
-
-
-class STARIMAResults(MLEResults):  # type: ignore[misc]  # statsmodels ships no types
-    """A fitted STARIMA, or one filtered with given parameters; statsmodels' results with a few verbs more."""
-
-    def update(self, row: Any) -> STARIMAResults:
-        """Results that know one more row (N,), NaN where a value is missing, with the parameters as they were.
-
-        One step of the filter: cheap enough for every cycle. Forecasts start after the new row; what concerns the
-        sample, such as `resid` and `llf`, is about the new row alone. To keep or refit the whole sample, `append` all
-        new rows to the fitted results.
-        """
-        values = np.asarray(row, dtype=np.float64).ravel()
-        if len(values) != self.model.k_endog:
-            raise SettingError(f"row: {len(values)} values for {self.model.k_endog} series; give one per series")
-        result: STARIMAResults = self.extend(values[None])
-        return result
-
-    def extend(self, endog: Any, exog: Any = None, fit_kwargs: Any = None, **kwargs: Any) -> Any:
-        """As statsmodels' own; all new rows count in the likelihood, since the levels before them are known."""
-        return super().extend(endog, exog, fit_kwargs, **{"loglikelihood_burn": 0, **kwargs})
-
-    def simulate(self, nsimulations: int, *, anchor: Any = None, initial_state: Any = None, **kwargs: Any) -> Any:
-        """As statsmodels' own: from the `anchor` "start", as `STARIMA.simulate`, or "end", on from the sample."""
-        if anchor in (None, "start", 0) and initial_state is None:
-            return self.model.simulate(self.params, nsimulations, includes_fixed=True, **kwargs)
-        return super().simulate(nsimulations, anchor=anchor, initial_state=initial_state, **kwargs)
-
-    def portmanteau(self, nlags: int = 10) -> space_time.Portmanteau:
-        """Test that the residuals are white in time and in space; they are scaled to one variance at all sites."""
-        form: Form = self.model.form
-        coefficients = form.names[form.parts[1].start : form.parts[2].stop]
-        fitted = sum(name not in self.fixed_params for name in coefficients)
-        return space_time.portmanteau(self._white(), form.weights, nlags, fitted)
-
-    def stacf(self, nlags: int = 10) -> Floats:
-        """(nlags, 1 + orders) space-time autocorrelations of the residuals."""
-        return space_time.stacf(self._white(), self.model.form.weights, nlags)
-
-    def _white(self) -> Floats:
-        """(T - burn, N) one-step errors over their standard deviations."""
-        return np.asarray(self.standardized_forecasts_error.T[self.loglikelihood_burn :])
-
-    def summary(self, alpha: float = 0.05, **kwargs: Any) -> Any:
-        """The summary of statsmodels, with the space-time portmanteau test in place of its tests series by series."""
-        model = self.model
-        name = [f"STARIMA{model.order}"]
-        name += [f"seasonal differences {model.seasonal_diff}"] if model.seasonal_diff[0] else []
-        settings = {
-            "title": "STARIMA Results",
-            "model_name": name,
-            "display_diagnostics": False,
-            "display_max_endog": 3,
-        }
-        table = super().summary(alpha=alpha, **{**settings, **kwargs})
-        # Too few rows, as after `update`, have no test.
-        with contextlib.suppress(SettingError):
-            test = self.portmanteau()
-            table.extra_txt = (
-                f"Space-time portmanteau: {test.statistic:.2f}, df {test.df}, p {test.pvalue:.3f}\n\n{table.extra_txt}"
-            )
-        return table
-
-
-def _series(endog: Any) -> Any:
-    """As floats, a DataFrame or Series as such; SettingError where it is not (T, N) numbers or NaN."""
-    framed = isinstance(endog, pd.DataFrame | pd.Series)
-    try:
-        series = endog.astype(np.float64) if framed else np.asarray(endog, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise SettingError(f"endog: {error}; give numbers, NaN where one is missing") from error
-    if series.ndim not in (1, 2) or not series.size:
-        raise SettingError(f"endog: shape {series.shape}; give (T, N), a row per step and a column per site")
-    if np.isinf(np.asarray(series)).any():
-        raise SettingError("endog: a value is infinite; give NaN where one is missing")
-    return series
-
-
-def _unit(differences: Floats) -> float:
-    """What to measure a diffuse variance in: 1, or the variance of the differences if that is of another order."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        variance = float(np.nanvar(differences))
-    return 1.0 if not variance > 0 or SMALL < variance < 1 / SMALL else variance
-
-
-def _integers(name: str, given: Any, count: int) -> tuple[int, ...]:
-    """`given` as a tuple of so many integers, none negative."""
-    try:
-        numbers = tuple(int(number) for number in given)
-    except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != count or min(numbers, default=0) < 0 or numbers != tuple(given):
-        raise SettingError(f"{name}: {given!r} is not {count} integer{'s' * (count != 1)} of 0 or more")
-    return numbers
-
-
-def _terms(part: str, lags: int, spatial: int | Sequence[int], orders: int) -> tuple[Term, ...]:
-    """(time lag, spatial order) of each coefficient of one part of the model."""
-    each = _integers(f"spatial, {part}", (spatial,) * lags if isinstance(spatial, int | np.integer) else spatial, lags)
-    if max(each, default=0) > orders:
-        raise SettingError(
-            f"spatial: {part} order {max(each)} wants W_1 to W_{max(each)}; weights has {orders} of them beside W_0 = I"
-        )
-    return tuple((lag, order) for lag, most in enumerate(each, start=1) for order in range(most + 1))
