@@ -445,6 +445,8 @@ ROWS = np.random.default_rng(15).normal(size=(30, 3))
         (ROWS, {"spatial": ((1, 0), 0)}, r"spatial, AR: \(1, 0\) is not 1 integer"),
         (ROWS, {"weights": [LINE[:2, :2]]}, r"weights: W_1 has shape \(2, 2\); 3 series want \(3, 3\)"),
         (ROWS, {"weights": [-LINE]}, "weights: W_1.* finite and not negative"),
+        (ROWS, {"weights": [LINE, LINE > 0]}, "weights: W_2 and W_1 are the same"),
+        (ROWS, {"weights": [0 * LINE], "spatial": (1, 0)}, "weights: W_1 has no neighbours at all; lower the spatial"),
         (ROWS, {"seasonal_diff": (1, 0)}, "seasonal_diff: 1 differences at a season of 0"),
         (ROWS, {"seasonal_diff": (1, 2000)}, "STARIMA: 6003 states are more than 3000"),
         (ROWS, {"trend": "ct"}, "trend: 'ct' is unknown"),

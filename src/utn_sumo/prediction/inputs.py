@@ -49,11 +49,17 @@ def integers(name: str, given: Any, count: int) -> tuple[int, ...]:
     return numbers
 
 
-def terms(part: str, lags: int, spatial: int | Sequence[int], orders: int) -> tuple[Term, ...]:
+def terms(part: str, lags: int, spatial: int | Sequence[int], weights: Floats) -> tuple[Term, ...]:
     """(time lag, spatial order) of each coefficient of one part of the model."""
     each = integers(f"spatial, {part}", (spatial,) * lags if isinstance(spatial, int | np.integer) else spatial, lags)
-    if max(each, default=0) > orders:
+    most, given = max(each, default=0), len(weights) - 1
+    if most > given:
         raise SettingError(
-            f"spatial: {part} order {max(each)} wants W_1 to W_{max(each)}; weights has {orders} of them beside W_0 = I"
+            f"spatial: {part} order {most} wants W_1 to W_{most}; weights has {given} of them beside W_0 = I"
         )
-    return tuple((lag, order) for lag, most in enumerate(each, start=1) for order in range(most + 1))
+    for order in range(most + 1):
+        if not weights[order].any():
+            raise SettingError(
+                f"weights: W_{order} has no neighbours at all; lower the spatial order of the {part} part"
+            )
+    return tuple((lag, order) for lag, highest in enumerate(each, start=1) for order in range(highest + 1))

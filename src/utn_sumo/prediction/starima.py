@@ -108,8 +108,8 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
             raise SettingError(
                 f"spatial: {spatial!r} is no pair; give (m, n), the spatial orders of the AR and MA parts"
             )
-        ar = inputs.terms("AR", p, spatial[0], len(matrices) - 1)
-        ma = inputs.terms("MA", q, spatial[1], len(matrices) - 1)
+        ar = inputs.terms("AR", p, spatial[0], matrices)
+        ma = inputs.terms("MA", q, spatial[1], matrices)
         self.order, self.seasonal_diff = (p, d, q), (times, period)
         self.enforce_stationarity, self.enforce_invertibility = enforce_stationarity, enforce_invertibility
         self.polynomial = difference_polynomial(d, (times, period))

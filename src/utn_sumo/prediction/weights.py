@@ -20,7 +20,8 @@ def checked(weights: Weights, sites: int) -> Floats:
     """(1 + orders, N, N) spatial weights with W_0 = I in front, given W_1..W_k or W_0..W_k with W_0 = I.
 
     Each row is divided by its sum, so that a matrix of zeros and ones does; a row of zeros, a site without
-    neighbours of that order, stays zero. Raises SettingError for a wrong shape, for negative or non-finite weights.
+    neighbours of that order, stays zero. Raises SettingError for a wrong shape, for negative or non-finite weights,
+    for two orders that are the same.
     """
     given = [np.array(matrix, dtype=np.float64) for matrix in weights]
     identity = np.eye(sites)
@@ -38,7 +39,12 @@ def checked(weights: Weights, sites: int) -> Floats:
             raise SettingError(
                 f"weights: W_{order}[{row}, {column}] is {matrix[row, column]:g}; weights are finite and not negative"
             )
-    return np.stack([_rows_to_one(matrix) for matrix in given])
+    found = np.stack([_rows_to_one(matrix) for matrix in given])
+    for order, matrix in enumerate(found):
+        for other in range(order):
+            if matrix.any() and (matrix == found[other]).all():
+                raise SettingError(f"weights: W_{order} and W_{other} are the same; give each order its own neighbours")
+    return found
 
 
 def network_weights(
