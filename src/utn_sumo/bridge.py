@@ -15,11 +15,11 @@ import numpy as np
 
 import utn_sumo
 from utn_sumo import calibration, controllers, demand, metrics, monitor, network, recording
-from utn_sumo.contract import Floats
+from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.sumo import SumoPlant
-from utn_sumo.prediction import ProfileForecast
+from utn_sumo.prediction import Predictor
 from utn_sumo.scenario import Scenario
 from utn_sumo.supervisor import Decision, Supervisor
 
@@ -61,8 +61,7 @@ def run(
     routes = folder / "routes.rou.xml"
     shutil.copyfile(drawn, routes)
     shutil.copyfile(net.net_file, folder / "net.net.xml")
-    profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
-    predictor = ProfileForecast(profile_veh_h * step_s / 3600)
+    predictor = _predictor(net, scenario, routes, steps)
     disturbance_veh = scenario.disturbance * scenario.demand * step_s / 3600
     estimator = Estimator(net, known, scenario.loop_error, disturbance_veh)
     miscount = Miscount(net, scenario.loop_error, scenario.seed)
@@ -70,14 +69,14 @@ def run(
     tally = _Tally()
     interrupted = False
 
-    with SumoPlant(net, routes, folder, seed=scenario.seed, duration_s=duration_s) as plant:
+    with predictor, SumoPlant(net, routes, folder, seed=scenario.seed, duration_s=duration_s) as plant:
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
         recorder = recording.Recorder(folder, {"scenario": scenario.model_dump(), "versions": _versions(plant.version)})
         state = estimator.initial()
         try:
             for step in range(steps):
-                ahead = predictor.forecast(step, controller.horizon)
+                ahead = predictor.forecast(controller.horizon)
                 decision = supervisor.ask(state, ahead)
                 seen = miscount.distort(plant.run(decision.plan))
                 recorder.write(
@@ -90,7 +89,9 @@ def run(
                         "truth": plant.truth,
                     }
                 )
-                state = estimator.update(seen, predictor.expected_veh(step))
+                before, state = state, estimator.update(seen, ahead.demand_veh[0])
+                waited = (before.source_queue_veh > 0) | (state.source_queue_veh > 0)
+                predictor.observe(seen.entered_veh.sum(axis=0), waited, state.disturbance_veh)
                 tally.add(decision, plant, np.bincount(net.turn_link, seen.turned_veh).astype(float))
                 if on_cycle:
                     queue_veh = float(seen.queue_veh.sum() + state.source_queue_veh.sum())
@@ -126,6 +127,21 @@ def run(
     }
     recording.write_json(folder / recording.RESULT, result)
     return result
+
+
+def _predictor(net: Network, scenario: Scenario, routes: Path, steps: int) -> Predictor:
+    """What foretells the scenario's demand and disturbances; only a perfect forecast may look into the `routes`."""
+    profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
+    coming_veh = demand.coming_veh(net, routes, steps) if scenario.forecast == "perfect" else None
+    return Predictor(
+        net,
+        scenario.forecast,
+        profile_veh=profile_veh_h * net.control_step_s / 3600,
+        coming_veh=coming_veh,
+        disturbed=scenario.disturbance > 0,
+        refit_steps=scenario.refit_steps,
+        background=True,
+    )
 
 
 class _Tally:

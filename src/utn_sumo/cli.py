@@ -31,6 +31,8 @@ def cli() -> None:
 @click.option("--disturbance", help="Vehicles an hour that come onto each link amid it, uncounted.  [0]")
 @click.option("--seed", help="Seed of demand and SUMO.  [1]")
 @click.option("--loop-error", help="Share of vehicles by which loops miscount, its spread over the loops.  [0]")
+@click.option("--forecast", help="Forecasts: starima, arima, profile, last or perfect.  [starima]")
+@click.option("--refit-steps", help="Control steps between two fits of the forecast's model.  [15]")
 @click.option("--calibration", help="Calibration file for the model, or none.  [the one beside the net]")
 @click.option("--horizon", help="Prediction horizon Kp of a predictive controller, in cycles.  [7]")
 @click.option("--control-horizon", help="Control horizon Kc, in cycles.  [4]")
@@ -107,6 +109,34 @@ def mismatch(out: Path | None, with_floor: bool, as_json: bool, demand: str, **f
         )
     recording.write_json(folder / "mismatch.json", {"results": results})
     click.echo(json.dumps(recording.plain(results))) if as_json else report.mismatch_table(results, folder)
+
+
+@cli.command("forecast-report")
+@click.argument("folders", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--net", default="utn17", show_default=True, help="Shipped network, or a .net.xml file.")
+@click.option("--controller", default="dmpc", show_default=True, help="Controller of the recorded runs.")
+@click.option("--hours", default="4", show_default=True, help="Simulated hours of each run.")
+@click.option("--demand", default="1.0", show_default=True, help="Scale of the demand profile.")
+@click.option("--profile", default="peak", show_default=True, help="Demand profile: peak, paper or constant.")
+@click.option("--noise", default="0.3", show_default=True, help="Standard deviation of the correlated demand noise.")
+@click.option("--seeds", default="20", show_default=True, help="How many seeds, from 1 on.")
+@click.option("--horizon", default="7", show_default=True, help="Control steps ahead.")
+@click.option("--refit-steps", default="15", show_default=True, help="Control steps between two fits of a model.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
+def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, as_json: bool, **flags: Any) -> None:
+    """Measure the forecasts' errors by method on the recorded runs in FOLDERS, or on runs made for it."""
+    from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
+    from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy
+
+    steps, refit_steps = (_whole(name, flags.pop(name)) for name in ("horizon", "refit_steps"))
+    items = [] if folders else [scenario(**flags, seed=seed) for seed in range(1, 1 + _whole("seeds", seeds))]
+    folder = recording.new_folder(out, "forecast-report")
+    with report.counter("runs and forecasts", len(items) + len(folders or items)) as tick:
+        runs = folders or study.record(items, folder, tick)
+        result = study.study_forecasts(runs, folder, horizon=steps, refit_steps=refit_steps, tick=tick)
+    recording.write_json(folder / "forecasts.json", result)
+    click.echo(json.dumps(recording.plain(result))) if as_json else report.forecast_table(result, folder)
 
 
 @cli.command()

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from defusedxml import ElementTree
 
 from utn_sumo.contract import EXIT, Floats, Network
 from utn_sumo.errors import SettingError
@@ -115,6 +116,17 @@ def route_file(
     except OSError as error:
         raise SettingError(f"cache folder {str(folder)!r} can't be used ({error.strerror}): set UTN_CACHE") from error
     return path
+
+
+def coming_veh(network: Network, routes: Path, steps: int) -> tuple[Floats, Floats]:
+    """What a route file of ours really brings: demand at the sources and disturbances amid links, (steps, Z) each."""
+    link_of = {link.edges[0]: index for index, link in enumerate(network.links)}
+    demand_veh, disturbance_veh = (np.zeros((steps, len(network.links))) for _ in range(2))
+    for vehicle in ElementTree.parse(routes).getroot().iter("vehicle"):
+        step = int(float(vehicle.get("depart", "0")) // network.control_step_s)
+        into = demand_veh if vehicle.get("departPos") is None else disturbance_veh
+        into[min(step, steps - 1), link_of[vehicle[0].get("edges", "").split()[0]]] += 1
+    return demand_veh, disturbance_veh
 
 
 class Trip(NamedTuple):

@@ -41,9 +41,9 @@ from typing import Any
 import numpy as np
 
 from utn_sumo import bridge, controllers, demand, fitted, network, plots, recording
-from utn_sumo.contract import EXIT, Network, State
+from utn_sumo.contract import EXIT, Forecast, Network, State
 from utn_sumo.plant.macroscopic import MacroscopicPlant, Passed
-from utn_sumo.prediction import ProfileForecast
+from utn_sumo.prediction import Predictor
 from utn_sumo.recording import Log
 from utn_sumo.scenario import Scenario, scenario
 
@@ -96,7 +96,7 @@ class Variant:
         chosen: dict[str, Any] = {"controller": self.controller, "settings": self.settings}
         if self.scaled:
             chosen = {"controller": f"{fitted.__file__}:{fitted.Fitted.__name__}", "settings": chosen}
-        return scenario(net=NET, profile="paper", **chosen, **given)
+        return scenario(net=NET, profile="paper", forecast="profile", **chosen, **given)
 
 
 DROPPED = {**NUMBERS, "constraints": "dropped"}
@@ -181,18 +181,22 @@ def on_model(net: Network, chosen: Scenario) -> tuple[dict[str, Any], Log]:
     )
     drawn_veh = drawn_veh_h * net.control_step_s / 3600
     mean_veh_h = demand.mean_profile_veh_h(net, chosen.profile, steps, chosen.demand)
-    predictor = ProfileForecast(mean_veh_h * net.control_step_s / 3600)
+    # Forecasts of a mean that never changes are that mean, whatever the method.
+    predictor = Predictor(net, "profile", profile_veh=mean_veh_h * net.control_step_s / 3600)
     controller = controllers.build(chosen.controller, net, chosen.settings)
     plant = MacroscopicPlant(net, drawn_veh)
-    states, passed, control_time_s = [plant.state], list[Passed](), 0.0
-    for step in range(steps):
-        ahead = predictor.forecast(step, controller.horizon)
+    states, passed, forecasts, control_time_s = [plant.state], list[Passed](), list[Forecast](), 0.0
+    for _ in range(steps):
+        ahead = predictor.forecast(controller.horizon)
         started = time.perf_counter()
         plan = controller.plan(plant.state, ahead)
         control_time_s += time.perf_counter() - started
         passed.append(plant.run(plan))
         states.append(plant.state)
-    log = _log(net, states, passed, predictor)
+        waited = (states[-2].source_queue_veh > 0) | (states[-1].source_queue_veh > 0)
+        predictor.observe(passed[-1].entered_veh.sum(axis=0), waited, states[-1].disturbance_veh)
+        forecasts.append(ahead)
+    log = _log(net, states, passed, forecasts)
     misfits = [each.misfits for each in passed]
     left_veh = float(log.turned_veh[..., net.turn_next == EXIT].sum())
     return {
@@ -213,7 +217,7 @@ def on_model(net: Network, chosen: Scenario) -> tuple[dict[str, Any], Log]:
     }, log
 
 
-def _log(net: Network, states: Sequence[State], passed: Sequence[Passed], predictor: ProfileForecast) -> Log:
+def _log(net: Network, states: Sequence[State], passed: Sequence[Passed], forecasts: Sequence[Forecast]) -> Log:
     """What SUMO's runs leave on disk, of a run of the model: measured and true are the same here."""
     before, after = states[:-1], states[1:]
     columns = {
@@ -222,7 +226,7 @@ def _log(net: Network, states: Sequence[State], passed: Sequence[Passed], predic
         "source_queue_veh": [state.source_queue_veh for state in before],
         "fraction": [state.fraction for state in before],
         "green_s": [each.green_s for each in passed],
-        "forecast_veh": [predictor.expected_veh(step) for step in range(len(passed))],
+        "forecast_veh": [ahead.demand_veh[0] for ahead in forecasts],
         "entered_by_sample_veh": [each.entered_veh for each in passed],
         "turned_veh": [state.turned_veh for state in after],
         "true_x_veh": [state.x_veh for state in after],

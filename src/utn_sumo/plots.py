@@ -22,6 +22,23 @@ ORDERS = (MODEL, PERSISTENCE, HISTORY, FLOOR)
 LAG_TICKS = 25
 
 
+def forecasts(result: dict[str, Any], folder: Path) -> None:
+    """Write the error of each method by step ahead as `forecasts.png` into `folder`, but for the perfect one."""
+    plt = _pyplot()
+    ahead = np.arange(1, result["horizon"] + 1)
+    figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
+    styles = {"starima": (MODEL, "o-"), "arima": (FLOOR, "^-"), "profile": (INK, "s--"), "last": (PERSISTENCE, "v:")}
+    for method, (color, style) in styles.items():
+        found = result["methods"][method]
+        axes.plot(ahead, found["rmse_veh_h"], style, color=color, label=method)
+        axes.fill_between(ahead, found["low_veh_h"], found["high_veh_h"], color=color, alpha=0.2, linewidth=0)
+    axes.set(xlabel="control steps ahead", ylabel="RMSE of a source's demand (veh/h)", xticks=ahead)
+    axes.set_title("{net}, demand {demand:g}, noise {noise:g}, {runs} runs of {hours:g} h".format(**result))
+    axes.legend(frameon=False)
+    figure.savefig(folder / "forecasts.png", dpi=150)
+    plt.close(figure)
+
+
 def mismatch(result: dict[str, Any], network: Network, found: Errors, folder: Path) -> None:
     """Write three PNG files for one demand into `folder`."""
     plt = _pyplot()

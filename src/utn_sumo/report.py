@@ -152,6 +152,29 @@ def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
     console.print(f"plots and mismatch.json: {folder}", markup=False)
 
 
+def forecast_table(result: dict[str, Any], folder: Path) -> None:
+    """Error by method and step ahead, with intervals."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    title = "RMSE of a source's demand (veh/h), {net}, demand {demand:g}, noise {noise:g}, {runs} runs of {hours:g} h"
+    view = Table(title=title.format(**result), title_justify="left")
+    view.add_column("method")
+    for ahead in range(1, result["horizon"] + 1):
+        view.add_column(f"{ahead} ahead", justify="right")
+    view.add_column("all steps (95 %)", justify="right")
+    view.add_column("over profile's (95 %)", justify="right")
+    for method, found in result["methods"].items():
+        low, high = found["all_steps_low_veh_h"], found["all_steps_high_veh_h"]
+        view.add_row(
+            method,
+            *(f"{value:.1f}" for value in found["rmse_veh_h"]),
+            f"{found['all_steps_rmse_veh_h']:.1f} ({low:.1f} to {high:.1f})",
+            f"{found['ratio_to_profile']:.4f} +- {found['ratio_half_width']:.4f}",
+        )
+    console.print(view)
+    console.print("intervals within runs: what one run has more error than another is taken away", highlight=False)
+    console.print(f"plot and forecasts.json: {folder}", markup=False, highlight=False)
+
+
 def calibration_table(content: dict[str, Any]) -> None:
     """Parameters by link with their standard errors."""
     console = Console(width=None if sys.stdout.isatty() else 120)

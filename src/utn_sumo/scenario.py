@@ -33,6 +33,10 @@ class Scenario(BaseModel):
     """Vehicles an hour that come onto each link amid it, where no loop counts them, for each unit of `demand`."""
     loop_error: float = Field(0.0, ge=0, le=0.2)
     """Standard deviation, over the loops, of the share of vehicles that a loop misses or counts twice."""
+    forecast: Literal["starima", "arima", "profile", "last", "perfect"] = "starima"
+    """How demand and disturbances are foretold."""
+    refit_steps: int = Field(15, ge=1, le=100_000)
+    """Control steps between two fits of the forecast's model."""
     calibration: str | None = None
     """Calibration file for the model; `none` for none, else the one beside the net if there is one."""
     seed: int = Field(1, ge=0, le=2**31 - 1)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from utn_sumo import bridge, calibration, floor, mismatch, network, plots, recording
+from utn_sumo import bridge, calibration, floor, forecast_report, mismatch, network, plots, recording
 from utn_sumo.errors import SettingError
 from utn_sumo.model import check_step
 from utn_sumo.recording import Log
@@ -84,6 +85,32 @@ def study_mismatch(
         )
         plots.mismatch(results[-1], model, found, folder)
     return results
+
+
+def study_forecasts(
+    folders: Sequence[Path], folder: Path, *, horizon: int, refit_steps: int, tick: Callable[[], None]
+) -> dict[str, Any]:
+    """Errors of the forecasts over recorded runs, as `forecast_report.summary` gives them; a plot into `folder`."""
+    jobs = [(path, horizon, refit_steps) for path in folders]
+    runs = []
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
+        for found in pool.map(_judge, jobs):
+            runs.append(found)
+            tick()
+    first = recording.read_json(folders[0], recording.SETTINGS)["scenario"]
+    kept = ("net", "controller", "demand", "profile", "noise", "hours")
+    result = {
+        **{name: first[name] for name in kept},
+        "runs": len(runs),
+        "horizon": horizon,
+        "methods": forecast_report.summary(runs),
+    }
+    plots.forecasts(result, folder)
+    return result
+
+
+def _judge(job: tuple[Path, int, int]) -> dict[str, list[float]]:
+    return forecast_report.rmse_veh_h(*job)
 
 
 def study_calibration(

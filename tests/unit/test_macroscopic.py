@@ -7,12 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from utn_sumo.contract import EXIT, Floats, Network, Plan
+from utn_sumo.contract import EXIT, Floats, Forecast, Network, Plan
 from utn_sumo.errors import PlantError
 from utn_sumo.fitted import Fitted, fit_s
 from utn_sumo.model import LinkModel, ModelState, green_windows
 from utn_sumo.plant.macroscopic import MacroscopicPlant, Misfits, showable_s
-from utn_sumo.prediction import ProfileForecast
 from utn_sumo.signals import admit
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -136,7 +135,7 @@ def test_fitted_asks_the_controller_that_it_is_told(utn17: Network) -> None:
     demand = np.tile(25.0 * utn17.is_source, (1, 1))
     fitted = Fitted(utn17, "dmpc", {"horizon": 2, "cost": "paper", "constraints": "dropped"})
     assert fitted.horizon == 2
-    plan = fitted.plan(MacroscopicPlant(utn17, demand).state, ProfileForecast(demand).forecast(0, 2))
+    plan = fitted.plan(MacroscopicPlant(utn17, demand).state, Forecast(np.tile(demand, (2, 1))))
     assert plan.ahead_s is not None
     for green in (plan.green_s, *plan.ahead_s):
         admit(Plan(green), utn17)

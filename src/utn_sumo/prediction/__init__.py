@@ -1,6 +1,6 @@
 """What will come from outside: the forecast that a controller is handed each control step, and the models behind it.
 
-    ProfileForecast                     the historical profile, step by step
+    Predictor                           each control step's forecast, by any of five methods
     STARIMA, STARIMAResults             space-time ARIMA on statsmodels' state space
     stacf, stpacf, portmanteau          which orders to try, and what the residuals still hold
     select_order                        the orders by AIC or BIC
@@ -19,7 +19,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from utn_sumo.prediction.profile import ProfileForecast
+from utn_sumo.prediction.predictor import METHODS, Predictor
 from utn_sumo.prediction.space_time import Portmanteau, portmanteau, stacf, stpacf
 from utn_sumo.prediction.weights import network_weights
 
@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     from utn_sumo.prediction.starima import STARIMA
 
 __all__ = [
+    "METHODS",
     "STARIMA",
     "OrderSelection",
     "Portmanteau",
-    "ProfileForecast",
+    "Predictor",
     "STARIMAResults",
     "network_weights",
     "portmanteau",
