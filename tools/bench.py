@@ -6,8 +6,9 @@
     python tools/bench.py step         the model's step: what a finer one costs and brings, in prediction and in control
     python tools/bench.py estimate     vehicles estimated from loops that miscount: counting against the filter
     python tools/bench.py forecast     STARIMA: time to fit, and to update and forecast each cycle
+    python tools/bench.py foresight    what forecasts are worth in closed loop, against perfect ones
 
-Each prints a table, or with --json one object (traffic, step and estimate: a list of objects).
+Each prints a table, or with --json one object (traffic, step, estimate and foresight: a list of objects).
 """
 
 from __future__ import annotations
@@ -287,6 +288,59 @@ def forecast(net: str, rows: int, repeats: int, as_json: bool) -> None:
         f"{net}, STARIMA of {found['series']} series: median of {repeats}",
         ["figure", "value"],
         [[key, _text(value)] for key, value in found.items()],
+    )
+
+
+@bench.command()
+@click.option("--net", default="utn17", show_default=True)
+@click.option("--hours", default=2.0, show_default=True)
+@click.option("--forecasts", default="starima,profile,last", show_default=True, help="Methods beside perfect.")
+@click.option("--demands", default="1.0,1.3", show_default=True)
+@click.option("--noises", default="0,0.3", show_default=True)
+@click.option("--seeds", default="1,2,3,4,5", show_default=True)
+@click.option("--json", "as_json", is_flag=True)
+def foresight(forecasts: str, demands: str, noises: str, seeds: str, *, as_json: bool, **given: Any) -> None:
+    """What forecasts are worth in closed loop: total delay over that with perfect ones, in parallel processes."""
+    methods = ["perfect", *forecasts.split(",")]
+    cases = [(float(demand), float(noise)) for demand in demands.split(",") for noise in noises.split(",")]
+    jobs = [
+        {**given, "forecast": method, "demand": demand, "noise": noise, "seed": int(seed)}
+        for demand, noise in cases
+        for method in methods
+        for seed in seeds.split(",")
+    ]
+    with ProcessPoolExecutor(os.cpu_count(), max_tasks_per_child=1) as pool:
+        results = list(pool.map(_traffic_job, jobs))
+    delays: dict[tuple[float, float, str], list[float]] = {}
+    for job, result in zip(jobs, results, strict=True):
+        delays.setdefault((job["demand"], job["noise"], job["forecast"]), []).append(result["total_delay_veh_h"])
+    found: list[dict[str, Any]] = [
+        {
+            "demand": demand,
+            "noise": noise,
+            "forecast": method,
+            "total_delay_veh_h": delays[demand, noise, method],
+            "over_perfect": sum(delays[demand, noise, method]) / sum(delays[demand, noise, "perfect"]),
+        }
+        for demand, noise in cases
+        for method in methods
+    ]
+    if as_json:
+        click.echo(json.dumps(found))
+        return
+    _show(
+        "{net}, {hours:g} h: total delay (veh h) by seed, and its sum over perfect forecasts'".format(**given),
+        ["demand", "noise", "forecast", "by seed", "over perfect"],
+        [
+            [
+                f"{each['demand']:g}",
+                f"{each['noise']:g}",
+                each["forecast"],
+                " ".join(f"{delay:.0f}" for delay in each["total_delay_veh_h"]),
+                f"{each['over_perfect']:.3f}",
+            ]
+            for each in found
+        ],
     )
 
 

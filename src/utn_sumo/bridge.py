@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import utn_sumo
 from utn_sumo import calibration, controllers, demand, metrics, monitor, network, recording
@@ -69,7 +70,12 @@ def run(
     tally = _Tally()
     interrupted = False
 
-    with predictor, SumoPlant(net, routes, folder, seed=scenario.seed, duration_s=duration_s) as plant:
+    # Small matrices: more threads than one only wait for each other.
+    with (
+        threadpool_limits(1),
+        predictor,
+        SumoPlant(net, routes, folder, seed=scenario.seed, duration_s=duration_s) as plant,
+    ):
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
         recorder = recording.Recorder(folder, {"scenario": scenario.model_dump(), "versions": _versions(plant.version)})

@@ -131,6 +131,10 @@ def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, 
 
     steps, refit_steps = (_whole(name, flags.pop(name)) for name in ("horizon", "refit_steps"))
     items = [] if folders else [scenario(**flags, seed=seed) for seed in range(1, 1 + _whole("seeds", seeds))]
+    if len(folders or items) < 2:  # noqa: PLR2004 - an interval needs two
+        raise SettingError("forecasts are judged over runs: give two or more, as --seeds 2 or as folders")
+    for path in folders:
+        recording.read_json(path, recording.SETTINGS)
     folder = recording.new_folder(out, "forecast-report")
     with report.counter("runs and forecasts", len(items) + len(folders or items)) as tick:
         runs = folders or study.record(items, folder, tick)

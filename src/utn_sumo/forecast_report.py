@@ -18,7 +18,7 @@ import numpy as np
 
 from utn_sumo import demand, network, recording
 from utn_sumo.contract import Floats, Network
-from utn_sumo.errors import ResultError, SettingError
+from utn_sumo.errors import SettingError
 from utn_sumo.prediction.predictor import ADOPTED_AFTER, LEAST_ROWS, METHODS, Predictor
 from utn_sumo.recording import Log
 from utn_sumo.scenario import Scenario
@@ -75,12 +75,7 @@ def _errors_veh(predictor: Predictor, log: Log, coming_veh: Floats, net: Network
 
 
 def summary(runs: Sequence[dict[str, list[float]]]) -> dict[str, Any]:
-    """Means over runs with confidence intervals, by method, step by step and for all steps together.
-
-    Raises ResultError for fewer than two runs.
-    """
-    if len(runs) < 2:  # noqa: PLR2004 - an interval needs two
-        raise ResultError(f"forecasts are judged over runs: {len(runs)} is too few, give two or more")
+    """Means over two runs or more with confidence intervals, by method, step by step and for all steps together."""
     # (runs, methods, steps), the last one all steps together.
     by_step = np.array([[run[method] for method in METHODS] for run in runs])
     whole = np.concatenate([by_step, np.sqrt(np.mean(by_step**2, axis=2, keepdims=True))], axis=2)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from utn_sumo import bridge, calibration, floor, forecast_report, mismatch, network, plots, recording
 from utn_sumo.errors import SettingError
@@ -110,7 +111,8 @@ def study_forecasts(
 
 
 def _judge(job: tuple[Path, int, int]) -> dict[str, list[float]]:
-    return forecast_report.rmse_veh_h(*job)
+    with threadpool_limits(1):
+        return forecast_report.rmse_veh_h(*job)
 
 
 def study_calibration(

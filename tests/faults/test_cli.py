@@ -55,6 +55,14 @@ MISTAKES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "unknown setting in a scenario file": (("run", "--scenario", "typo.toml"), "'hourz'", "did you mean 'hours'"),
     "settings of the wrong shape": (("run", "--scenario", "shape.toml"), "'settings' is 3", "must be"),
     "output into a file": (("run", "--out", "file.txt"), "'file.txt'", "name another"),
+    "unknown forecast": (("run", "--forecast", "starma"), "'forecast' is 'starma'", "must be 'starima', 'arima'"),
+    "refits without an interval": (("run", "--refit-steps", "0"), "'refit_steps' is '0'", "must be greater than"),
+    "forecasts judged on one run": (("forecast-report", "--seeds", "1"), "runs", "--seeds 2"),
+    "forecasts judged on no runs": (
+        ("forecast-report", "none", "void"),
+        "'none'",
+        "give a folder that `utn run` wrote",
+    ),
     "replay of nothing": (("replay", "none"), "'none'", "give a folder that `utn run` wrote"),
 }
 

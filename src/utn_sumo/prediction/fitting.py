@@ -6,6 +6,7 @@ a line out, in JSON, until its input ends.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -116,8 +117,9 @@ class Background:
         assert self._process.stdout is not None
         self._process.kill()
         self._process.wait()
-        self._process.stdin.close()
         self._process.stdout.close()
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
 
 
 def fit(job: Job) -> list[Fit]:
