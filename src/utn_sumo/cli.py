@@ -175,7 +175,7 @@ def calibrate(out: Path, demand: str, seeds: str, step: str, **flags: Any) -> No
 def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: Any) -> None:
     """Repeat the paper's comparison of CMPC and DMPC, and show how its CMPC came to lose.
 
-    The 4 h runs in SUMO take about ten minutes on two free cores.
+    The 4 h runs in SUMO take ten minutes on two free cores, and up to half an hour on busy ones.
     """
     from utn_sumo import paper as comparison  # noqa: PLC0415 - heavy
     from utn_sumo import recording, report  # noqa: PLC0415 - heavy

@@ -12,8 +12,7 @@ from click.testing import CliRunner
 
 from utn_sumo import bridge, recording
 from utn_sumo.cli import cli
-from utn_sumo.prediction import METHODS
-from utn_sumo.prediction.predictor import ADOPTED_AFTER, LEAST_ROWS
+from utn_sumo.prediction.predictor import ADOPTED_AFTER, LEAST_ROWS, METHODS
 from utn_sumo.scenario import scenario
 
 SERVING = LEAST_ROWS + ADOPTED_AFTER

@@ -15,9 +15,9 @@ from threadpoolctl import threadpool_limits
 from utn_sumo import demand
 from utn_sumo.contract import Floats, Network
 from utn_sumo.errors import SettingError
-from utn_sumo.prediction import METHODS, Predictor, fitting
+from utn_sumo.prediction import Predictor, fitting
 from utn_sumo.prediction.fitting import Background, Here, Job
-from utn_sumo.prediction.predictor import ADOPTED_AFTER, LEAST_ROWS, SeriesPredictor
+from utn_sumo.prediction.predictor import ADOPTED_AFTER, LEAST_ROWS, METHODS, SeriesPredictor
 
 HORIZON = 7
 SERVING = LEAST_ROWS + ADOPTED_AFTER

@@ -19,7 +19,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from utn_sumo.prediction.predictor import METHODS, Predictor
+from utn_sumo.prediction.predictor import Predictor
 from utn_sumo.prediction.space_time import Portmanteau, portmanteau, stacf, stpacf
 from utn_sumo.prediction.weights import network_weights
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from utn_sumo.prediction.starima import STARIMA
 
 __all__ = [
-    "METHODS",
     "STARIMA",
     "OrderSelection",
     "Portmanteau",
