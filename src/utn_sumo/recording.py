@@ -98,17 +98,22 @@ def plain(value: Any) -> Any:
     """Anything as JSON has it: numbers rounded to six digits after the point, null for one that is not finite,
     text for what JSON does not know.
     """
+    # Most that a run writes is arrays of finite numbers: they go in one piece.
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f" and np.isfinite(value).all():
+        return np.round(value, 6).tolist()
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        value = round(value, 6) if math.isfinite(value) else None
+    if isinstance(value, bool | int | float | str | NoneType):
+        return value
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return round(value, 6) if math.isfinite(value) else None
-    return value if isinstance(value, bool | int | str | NoneType) else repr(value)
+    return repr(value)
 
 
 @dataclasses.dataclass(frozen=True)
