@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 import sys
 from pathlib import Path
@@ -63,6 +64,16 @@ def test_every_public_name_is_there_and_no_other() -> None:
     assert all(getattr(prediction, name).__name__ == name for name in prediction.__all__)
     with pytest.raises(AttributeError, match="has no attribute 'ARIMA'"):
         _ = prediction.ARIMA
+
+
+def test_a_model_without_series_is_fitted_to_the_series_that_it_is_given() -> None:
+    weights = [np.array([[0.0, 1.0], [1.0, 0.0]])]
+    series = STARIMA(np.zeros((80, 2)), (1, 0, 0), (1, 0), weights).simulate([0.4, 0.2, 1.0], 80, rng=3)
+    later = STARIMA(order=(1, 0, 0), spatial=(1, 0), weights=weights).fit(series, method="conditional")
+    at_once = STARIMA(series, order=(1, 0, 0), spatial=(1, 0), weights=weights).fit(method="conditional")
+    assert later.params == pytest.approx(at_once.params)
+    assert later.forecast(3) == pytest.approx(at_once.forecast(3))
+    assert copy.copy(at_once.model).loglike(at_once.params) == pytest.approx(at_once.llf)
 
 
 # The likelihood

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -34,6 +35,17 @@ STEP = 1e-3
 COVARIANCE = "Covariance matrix calculated from the information of the conditional likelihood."
 
 
+@dataclass(frozen=True)
+class Specification:
+    """A STARIMA that still wants its series: what `STARIMA(order=..., spatial=..., weights=...)` without `endog` is."""
+
+    settings: dict[str, Any]
+
+    def fit(self, endog: Any, **kwargs: Any) -> STARIMAResults:
+        """The results of `STARIMA(endog, ...)`, fitted with `kwargs`."""
+        return STARIMA(endog, **self.settings).fit(**kwargs)
+
+
 class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
     r"""Space-time autoregressive integrated moving average model of N series.
 
@@ -44,7 +56,8 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
     Signs are statsmodels': ma is +theta, where Pfeifer and Deutsch write -theta. Parameters are called
     `ar.L1.S0` (time lag 1, spatial order 0), `ma.L1.S1`, `sigma2`, and `mean.<series>`.
 
-    endog               (T, N) array or DataFrame; a (T,) one is one site. NaN is a missing value.
+    endog               (T, N) array or DataFrame; a (T,) one is one site. NaN is a missing value. Without it this is a
+                        `Specification`, whose `fit` takes the series.
     order               (p, d, q).
     spatial             (m, n): spatial orders of the autoregressive and of the moving average part, from 0 to m or n;
                         each an int for all time lags, or one int per time lag.
@@ -67,6 +80,10 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
 
     Further keywords go to `MLEModel`. Raises SettingError for whatever is out of range.
     """
+
+    def __new__(cls, endog: Any = None, *_: Any, **settings: Any) -> Any:
+        """A model, or a specification where there are settings and no series (a copy is made without either)."""
+        return Specification(settings) if endog is None and settings else super().__new__(cls)
 
     def __init__(
         self,
