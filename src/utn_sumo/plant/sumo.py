@@ -127,11 +127,11 @@ class SumoPlant:
                 self._entered.append((self.time_s, self._entered_so_far()))
                 x_veh = self._by_edge(self._sumo.edge.getLastStepVehicleNumber)
                 np.maximum(peak_x, x_veh, out=peak_x)
-                waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
-                present = self._sumo.vehicle.getIDCount() + waiting.sum()
+                present = self._sumo.vehicle.getIDCount() + len(self._sumo.simulation.getPendingVehicles())
                 spent_veh_s += present * (self.time_s - before_s)
                 queue_veh = self._by_edge(self._sumo.edge.getLastStepHaltingNumber)
                 np.maximum(peak_queue, queue_veh, out=peak_queue)
+            waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
             self.truth = Truth(
                 x_veh, waiting, queue_veh, peak_x, peak_queue, self._sumo.vehicle.getIDCount(), spent_veh_s / 3600
             )
