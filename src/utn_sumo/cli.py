@@ -188,6 +188,23 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
 
 
 @cli.command()
+@click.argument("net")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
+def inspect(net: str, out: Path | None, as_json: bool) -> None:
+    """Show what the bench makes of NET: links, stages, storage, what is controlled and what is left alone."""
+    from utn_sumo import inspection, network, plots, recording, report  # noqa: PLC0415 - heavy
+
+    found = network.load(net)
+    result = inspection.inspect(found)
+    folder = recording.new_folder(out, f"inspect-{found.name}")
+    recording.write_json(folder / "inspection.json", result)
+    refused = {each["id"] for each in result["junctions"] if each["refused"]}
+    plots.network_map(found, network.shapes(found.net_file), refused, folder / "map.png")
+    click.echo(json.dumps(recording.plain(result))) if as_json else report.inspection_table(result, folder)
+
+
+@cli.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 def replay(folder: Path) -> None:
     """Write the signals of the run in FOLDER as plain SUMO files that the bare `sumo` replays."""

@@ -109,6 +109,8 @@ class Network:
     """Time from the start of green until the queue moves over the stop line; the yellow gives it back at its end."""
     whole_step_s: float | None = None
     """Of a part: the control step of the network that it is a part of, which its own cycles need not tell."""
+    left_alone: Mapping[str, str] = field(default_factory=dict)
+    """Signals that are none of the junctions, and why: they keep the net's own programme."""
 
     @cached_property
     def turn_link(self) -> Ints:

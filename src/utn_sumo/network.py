@@ -7,7 +7,9 @@ its clearance, taken from the net and never optimised. Conflicts come from the n
 
 from __future__ import annotations
 
+import gzip
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -45,6 +47,7 @@ def read(path: Path, name: str) -> Network:
     """Read one net file. Raises NetworkError with one line if it can't be used."""
     import sumolib  # noqa: PLC0415 - heavy, and only this door needs it
 
+    _refuse_entities(path)
     try:
         net = sumolib.net.readNet(
             str(path), withPrograms=True, withLatestPrograms=True, withFoes=True, withInternal=False
@@ -57,7 +60,49 @@ def read(path: Path, name: str) -> Network:
     signals = sorted(net.getTrafficLights(), key=lambda tls: _natural(tls.getID()))
     if not signals:
         raise NetworkError(f"net {str(path)!r} has no traffic lights: there is nothing to control")
-    return _Reader(net, signals, _read_fractions(path)).network(path.resolve(), name)
+    left_alone = {tls.getID(): reason for tls in signals if (reason := _why_left_alone(tls))}
+    controlled = [tls for tls in signals if tls.getID() not in left_alone]
+    if not controlled:
+        reasons = "; ".join(f"{signal}: {reason}" for signal, reason in left_alone.items())
+        raise NetworkError(f"net {str(path)!r} has no signals that can be controlled ({reasons})")
+    return _Reader(net, controlled, _read_fractions(path)).network(path.resolve(), name, left_alone)
+
+
+def shapes(path: Path) -> dict[str, list[tuple[float, float]]]:
+    """The course of every road of a net file [m], by its edge, for drawing."""
+    import sumolib  # noqa: PLC0415 - heavy, and only this door needs it
+
+    return {edge.getID(): list(edge.getShape()) for edge in sumolib.net.readNet(str(path)).getEdges()}
+
+
+def _why_left_alone(tls: Any) -> str:
+    """Why a signal can't be controlled; empty if it can."""
+    program = next(iter(tls.getPrograms().values()), None)
+    if program is None:
+        return "it has no signal programme, as rail signals have none"
+    greens = sum(_is_green(phase.state) for phase in program.getPhases())
+    if greens == 0:
+        return "no phase of its programme shows green without yellow"
+    return "its programme has one stage: there is nothing to share out" if greens == 1 else ""
+
+
+def _refuse_entities(path: Path) -> None:
+    """Raise NetworkError for a file that declares a document type: nets have none, and entities can blow up."""
+    from defusedxml import ElementTree  # noqa: PLC0415
+    from defusedxml.common import DefusedXmlException  # noqa: PLC0415
+
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            next(ElementTree.iterparse(file, events=("start",), forbid_dtd=True))
+    except DefusedXmlException as error:
+        raise NetworkError(
+            f"net {str(path)!r} declares a document type, which may hide entities: give one that netconvert wrote"
+        ) from error
+    except (ElementTree.ParseError, OSError, EOFError, StopIteration) as error:
+        reason = str(error) or "it is empty"
+        raise NetworkError(
+            f"net {str(path)!r} can't be read ({reason}): give a .net.xml written by netconvert"
+        ) from error
 
 
 class _Reader:
@@ -79,7 +124,7 @@ class _Reader:
             member: index for index, edge in enumerate(self.approaches) for member in self.chains[edge]
         }
 
-    def network(self, path: Path, name: str) -> Network:
+    def network(self, path: Path, name: str, left_alone: Mapping[str, str]) -> Network:
         turns = self._turns()
         fed = {turn.next_link for turn in turns}
         links = tuple(self._link(edge, index in fed) for index, edge in enumerate(self.approaches))
@@ -88,17 +133,16 @@ class _Reader:
         junctions: list[Junction] = []
         for position, tls in enumerate(self.signals):
             signal_turn = self._signal_turns(tls, turn_index)
-            program = next(iter(tls.getPrograms().values()), None)
-            if program is None:
-                raise NetworkError(f"junction {tls.getID()!r} has no signal programme: add a tlLogic for it")
+            program = next(iter(tls.getPrograms().values()))
+            phases, begin_s = _from_first_green(program.getPhases())
             first = len(stages)
-            stages += _stages(tls.getID(), program, position, signal_turn)
+            stages += _stages(phases, position, signal_turn)
             junctions.append(
                 Junction(
                     id=tls.getID(),
                     stages=tuple(range(first, len(stages))),
-                    cycle_s=sum(phase.duration for phase in program.getPhases()),
-                    offset_s=float(program.getOffset()),
+                    cycle_s=sum(phase.duration for phase in phases),
+                    offset_s=float(program.getOffset()) + begin_s,
                     min_green_s=MIN_GREEN_S,
                     signal_turn=tuple(signal_turn),
                     conflicts=self._conflicts(tls, len(signal_turn)),
@@ -115,6 +159,7 @@ class _Reader:
             edge_lanes={edge: self.net.getEdge(edge).getLaneNumber() for edge in sorted(edges)},
             edge_length_m={edge: self.net.getEdge(edge).getLength() for edge in sorted(edges)},
             startup_lag_s=STARTUP_LAG_S,
+            left_alone=left_alone,
         )
 
     def _chain(self, approach: str) -> tuple[str, ...]:
@@ -200,14 +245,15 @@ class _Reader:
         return tuple(tuple(row) for row in matrix)
 
 
-def _stages(tls_id: str, program: Any, junction: int, signal_turn: list[int]) -> list[Stage]:
-    """Cut a programme into stages, each a green phase with the phases up to the next green one."""
-    phases = program.getPhases()
+def _from_first_green(phases: list[Any]) -> tuple[list[Any], float]:
+    """A programme's phases from its first green one on, round the cycle, and when in the cycle that one begins [s]."""
+    first = next(index for index, phase in enumerate(phases) if _is_green(phase.state))
+    return [*phases[first:], *phases[:first]], float(sum(phase.duration for phase in phases[:first]))
+
+
+def _stages(phases: list[Any], junction: int, signal_turn: list[int]) -> list[Stage]:
+    """Cut a programme that opens with green into stages: a green phase with the phases up to the next green one."""
     starts = [i for i, phase in enumerate(phases) if _is_green(phase.state)]
-    if len(starts) <= 1 or starts[0] != 0:
-        raise NetworkError(
-            f"junction {tls_id!r}: its programme must open with a green phase and have two or more of them"
-        )
     stages = []
     for start, end in pairwise([*starts, len(phases)]):
         green = phases[start].state

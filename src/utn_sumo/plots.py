@@ -5,6 +5,7 @@ The one door to matplotlib.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,36 @@ def trajectories(network: Network, log: Log, title: str, path: Path) -> None:
     figure.suptitle(title, y=0.975)
     figure.supxlabel("time (h)", fontsize=10)
     figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def network_map(
+    network: Network, shapes: Mapping[str, Sequence[tuple[float, float]]], refused: Collection[str], path: Path
+) -> None:
+    """Draw a net into a PNG file: its roads, its links by storage, its junctions; `refused` are those without a plan.
+
+    `shapes` are the courses of all roads [m], by their edges.
+    """
+    plt = _pyplot()
+    figure, axes = plt.subplots(figsize=(9, 7))
+    member = {edge for link in network.links for edge in link.edges}
+    for edge, course in shapes.items():
+        if edge not in member:
+            axes.plot(*np.array(course).T, color="#cccccc", linewidth=0.8, zorder=1)
+    storage = network.storage_veh
+    shade = plt.Normalize(0, storage.max())
+    for link, capacity in zip(network.links, storage, strict=True):
+        for edge in link.edges:
+            axes.plot(*np.array(shapes[edge]).T, color=plt.cm.viridis_r(shade(capacity)), linewidth=2.2, zorder=2)
+    for index, junction in enumerate(network.junctions):
+        ends = np.array([shapes[network.links[link].edges[-1]][-1] for link in network.links_of[index]])
+        x, y = ends.mean(axis=0)
+        color = PERSISTENCE if junction.id in refused else INK
+        axes.plot(x, y, "o", color=color, markersize=6, zorder=3)
+        axes.annotate(junction.id, (x, y), (4, 4), textcoords="offset points", fontsize=7, color=color, zorder=4)
+    figure.colorbar(plt.cm.ScalarMappable(shade, "viridis_r"), ax=axes, label="storage of a link (veh)", shrink=0.7)
+    axes.set(aspect="equal", xlabel="m", ylabel="m", title=f"{network.name}: links and controlled junctions")
+    figure.savefig(path, dpi=150, bbox_inches="tight")
     plt.close(figure)
 
 

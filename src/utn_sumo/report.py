@@ -152,6 +152,33 @@ def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
     console.print(f"plots and mismatch.json: {folder}", markup=False)
 
 
+def inspection_table(found: dict[str, Any], folder: Path) -> None:
+    """Junctions, links, and what is left alone."""
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    view = Table(title=f"{found['net']}: control step {found['control_step_s']:g} s", title_justify="left")
+    for head in ("junction", "cycle (s)", "offset (s)", "stages", "green to share (s)", "links", "controlled"):
+        view.add_column(head)
+    for each in found["junctions"]:
+        numbers = [f"{each[key]:g}" for key in ("cycle_s", "offset_s", "stages", "green_budget_s")]
+        view.add_row(
+            each["id"], *numbers, ", ".join(each["links"]), f"no: {each['refused']}" if each["refused"] else "yes"
+        )
+    for signal, reason in found["left_alone"].items():
+        view.add_row(signal, "", "", "", "", "", f"no: {reason}")
+    console.print(view)
+    view = Table()
+    for head in ("link", "to", "lanes", "length (m)", "storage (veh)", "saturation (veh/h)", "source", "turns: share"):
+        view.add_column(head)
+    for each in found["links"]:
+        turns = ", ".join(
+            f"{turn['next_link'] or 'exit ' + edge}: {turn['fraction']:.2f}" for edge, turn in each["turns"].items()
+        )
+        numbers = [f"{each[key]:.0f}" for key in ("lanes", "length_m", "storage_veh", "saturation_flow_veh_h")]
+        view.add_row(each["id"], each["junction"], *numbers, "yes" if each["is_source"] else "", turns)
+    console.print(view)
+    console.print(f"map.png and inspection.json: {folder}", markup=False, highlight=False)
+
+
 def forecast_table(result: dict[str, Any], folder: Path) -> None:
     """Error by method and step ahead, with intervals."""
     console = Console(width=None if sys.stdout.isatty() else 120)

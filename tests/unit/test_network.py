@@ -232,6 +232,71 @@ def test_a_net_without_traffic_lights_is_refused_in_one_line(tmp_path: Path) -> 
     assert "no traffic lights" in one_line_of(str(path))
 
 
+def edited(town: Path, *changes: tuple[str, str]) -> Path:
+    """The net with a piece of its text replaced, once each."""
+    content = town.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in content
+        content = content.replace(old, new, 1)
+    town.write_text(content, encoding="utf-8")
+    return town
+
+
+def programme(net: Network, junction: str) -> str:
+    """The text of a junction's programme in the shipped file."""
+    text = utn_network.net_file("utn17").read_text(encoding="utf-8")
+    start = text.index(f'<tlLogic id="{junction}"')
+    return text[start : text.index("</tlLogic>", start)]
+
+
+def test_a_programme_that_opens_with_its_clearance_has_the_same_stages_later_in_its_cycle(
+    town: Path, utn17: Network
+) -> None:
+    text = programme(utn17, "J2")
+    head, *phases = text.splitlines()
+    body = [line for line in phases if "<phase" in line]
+    turned = "\n".join([head.replace('offset="0"', 'offset="7"'), *body[1:], body[0], ""])
+    found = network.load(str(edited(town, (text, turned))))
+    junction, whole = found.junctions[1], utn17.junctions[1]
+    states = [[found.stages[stage].state for stage in junction.stages], [utn17.stages[s].state for s in whole.stages]]
+    # The first green is now the second stage's, 5 s of clearance after the programme's start.
+    assert states[0] == states[1][::-1]
+    assert junction.offset_s == 7 + 5
+    assert junction.cycle_s == whole.cycle_s
+    assert [found.stages[s].clearance for s in junction.stages] == [utn17.stages[s].clearance for s in whole.stages][
+        ::-1
+    ]
+
+
+def test_a_signal_that_can_not_be_controlled_is_named_and_left_alone(town: Path, utn17: Network) -> None:
+    text = programme(utn17, "J4")
+    lone = text.splitlines()[0] + '\n<phase duration="90" state="GGGGGG"/>\n'
+    found = network.load(str(edited(town, (text, lone))))
+    assert [junction.id for junction in found.junctions] == [f"J{n}" for n in (1, 2, 3, 5, 6, 7, 8)]
+    assert set(found.left_alone) == {"J4"}
+    assert "one stage" in found.left_alone["J4"]
+    # Its approaches are no links; what they fed is now fed from outside.
+    assert not {"8", "9"} & {link.id for link in found.links}
+    assert next(link for link in found.links if link.edges[-1] == "11").is_source
+
+
+def test_a_net_with_no_signal_to_control_is_refused_with_the_reasons(town: Path, utn17: Network) -> None:
+    texts = [programme(utn17, junction.id) for junction in utn17.junctions]
+    dull = [(text, text.splitlines()[0] + '\n<phase duration="90" state="rr"/>\n') for text in texts]
+    line = one_line_of(str(edited(town, *dull)))
+    assert "no signals that can be controlled" in line
+    assert "J1: no phase" in line
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_net_that_declares_entities_is_refused_before_they_are_read(town: Path, packed: bool) -> None:
+    lol = "".join(f'<!ENTITY l{n} "{f"&l{n - 1};" * 10}">' for n in range(1, 10))
+    content = f'<?xml version="1.0"?><!DOCTYPE net [<!ENTITY l0 "lol">{lol}]><net version="1.20">&l9;</net>'
+    path = town.with_name("bomb.net.xml.gz" if packed else "bomb.net.xml")
+    path.write_bytes(gzip.compress(content.encode()) if packed else content.encode())
+    assert "document type" in one_line_of(str(path))
+
+
 @pytest.mark.parametrize(
     "relations",
     [

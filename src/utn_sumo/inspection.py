@@ -1,0 +1,62 @@
+"""What the bench makes of a net: junctions and links as tables of plain data, and what it leaves alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from utn_sumo import signals
+from utn_sumo.contract import EXIT, Network
+from utn_sumo.errors import PlanError
+
+
+def inspect(network: Network) -> dict[str, Any]:
+    """`junctions`, `links` and `left_alone`, under names that carry their units."""
+    return {
+        "net": network.name,
+        "control_step_s": network.control_step_s,
+        "junctions": [_junction(network, index) for index in range(len(network.junctions))],
+        "links": [_link(network, index) for index in range(len(network.links))],
+        "left_alone": dict(network.left_alone),
+    }
+
+
+def _junction(network: Network, index: int) -> dict[str, Any]:
+    junction, part = network.junctions[index], network.part(index)
+    refused = ""
+    try:
+        signals.admit(part.equal_split(), part)
+    except PlanError as error:
+        refused = str(error).removeprefix(f"junction {junction.id}: ")
+    return {
+        "id": junction.id,
+        "cycle_s": junction.cycle_s,
+        "offset_s": junction.offset_s,
+        "stages": len(junction.stages),
+        "green_budget_s": float(part.green_budget_s[0]),
+        "min_green_s": junction.min_green_s,
+        "links": [link.id for link in part.links],
+        "refused": refused,
+    }
+
+
+def _link(network: Network, index: int) -> dict[str, Any]:
+    link = network.links[index]
+    turns = [turn for turn in network.turns if turn.link == index]
+    return {
+        "id": link.id,
+        "junction": network.junctions[link.junction].id,
+        "edges": list(link.edges),
+        "lanes": link.lanes,
+        "length_m": link.length_m,
+        "free_speed_m_s": link.free_speed_m_s,
+        "storage_veh": link.storage_veh,
+        "saturation_flow_veh_h": 3600 * link.saturation_flow_veh_s,
+        "is_source": link.is_source,
+        "turns": {
+            turn.to_edge: {
+                "next_link": None if turn.next_link == EXIT else network.links[turn.next_link].id,
+                "fraction": turn.fraction,
+            }
+            for turn in turns
+        },
+    }
