@@ -15,11 +15,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import utn_sumo
-from utn_sumo import calibration, controllers, demand, metrics, monitor, network, recording
+from utn_sumo import calibration, case, controllers, demand, metrics, monitor, native, network, recording
 from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
+from utn_sumo.errors import SettingError
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.sumo import SumoPlant
+from utn_sumo.plant.untouched import Look
 from utn_sumo.prediction import Predictor
 from utn_sumo.scenario import Scenario
 from utn_sumo.supervisor import Decision, Supervisor
@@ -42,6 +44,13 @@ def run(
 
     A KeyboardInterrupt ends the run early with a whole, readable result that says so. Raises UtnError.
     """
+    if scenario.controller == native.NAME:
+        return native.run(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
+    if scenario.net.endswith(case.SUFFIX):
+        raise SettingError(
+            f"setting 'controller' is {scenario.controller!r}: a {case.SUFFIX} runs under the net's own programmes so"
+            f" far, use --controller {native.NAME}, or give its net alone"
+        )
     net = network.load(scenario.net)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
@@ -133,6 +142,10 @@ def run(
     }
     recording.write_json(folder / recording.RESULT, result)
     return result
+
+
+def _progress(time_s: float, duration_s: float, seen: Look) -> Progress:
+    return Progress(time_s, duration_s, seen.time_spent_veh_h, float(seen.halting_veh))
 
 
 def _predictor(net: Network, scenario: Scenario, routes: Path, steps: int) -> Predictor:

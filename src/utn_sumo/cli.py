@@ -22,8 +22,9 @@ def cli() -> None:
 
 
 @cli.command()
+@click.argument("case", required=False)
 @click.option("--net", help="Shipped network, or a .net.xml file.  [utn17]")
-@click.option("--controller", help="Registered controller, or path.py:Class.  [dmpc]")
+@click.option("--controller", help="Registered controller, path.py:Class, or native: the net's own.  [dmpc]")
 @click.option("--hours", help="Simulated hours.  [4]")
 @click.option("--demand", help="Scale of the demand profile.  [1.0]")
 @click.option("--profile", help="Demand profile: peak, paper or constant.  [peak]")
@@ -42,7 +43,10 @@ def cli() -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
 @click.option("--json", "as_json", is_flag=True, help="Print the measures as one JSON object, and nothing else.")
 def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bool, **flags: str | None) -> None:
-    """Run a controller on a network in SUMO and measure it."""
+    """Run a controller on a network in SUMO and measure it.
+
+    CASE is a .sumocfg of your own, with net and demand; it runs with --controller native so far.
+    """
     from utn_sumo import bridge, report  # noqa: PLC0415 - heavy
     from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy
 
@@ -53,6 +57,10 @@ def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bo
         if not equals:
             raise SettingError(f"--set {pair!r}: write it as NAME=VALUE")
         settings[name.strip()] = _number(value.strip())
+    own = flags.pop("case")
+    if own is not None and flags["net"] is not None:
+        raise SettingError(f"setting 'net' is {flags['net']!r}, beside {own!r}: give one of them")
+    flags["net"] = flags["net"] or own
     given: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
     chosen = scenario(file, settings=settings, **given)
     with report.progress(chosen) as on_cycle:
@@ -193,9 +201,9 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
 def inspect(net: str, out: Path | None, as_json: bool) -> None:
     """Show what the bench makes of NET: links, stages, storage, what is controlled and what is left alone."""
-    from utn_sumo import inspection, network, plots, recording, report  # noqa: PLC0415 - heavy
+    from utn_sumo import case, inspection, network, plots, recording, report  # noqa: PLC0415 - heavy
 
-    found = network.load(net)
+    found = network.load(str(case.read(Path(net)).net_file) if net.endswith(case.SUFFIX) else net)
     result = inspection.inspect(found)
     folder = recording.new_folder(out, f"inspect-{found.name}")
     recording.write_json(folder / "inspection.json", result)
@@ -224,6 +232,7 @@ def controllers() -> None:
         click.echo(f"{name}: {(factory.__doc__ or '').strip().splitlines()[0]}")
         names = settings_of(factory)
         click.echo(f"    settings: {', '.join(names) if names else 'none'}")
+    click.echo("native: The net's own signal programmes, untouched.")
 
 
 @cli.group()

@@ -87,9 +87,9 @@ def table(result: dict[str, Any]) -> None:
     view.add_column("value", justify="right")
     view.add_column("unit")
     for key, label, unit, pattern in ROWS:
-        view.add_row(label, pattern.format(result[key]), unit)
+        view.add_row(label, "not known" if result[key] is None else pattern.format(result[key]), unit)
     console.print(view)
-    for reason in [*result["unsafe_reasons"], *result["fallback_reasons"]]:
+    for reason in [*result.get("unsafe_reasons", []), *result.get("fallback_reasons", [])]:
         console.print(f"  ! {reason}", markup=False)
     if result["interrupted"]:
         console.print("stopped before its end: the measures cover the time that was run")

@@ -83,7 +83,7 @@ class SumoPlant:
         try:
             libsumo.start(["sumo", *arguments])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-            raise PlantError(f"SUMO did not start ({_first_line(error)}): see {self.folder / 'sumo.log'}") from error
+            raise PlantError(f"SUMO did not start ({first_line(error)}): see {self.folder / 'sumo.log'}") from error
         self.sumo_time_s = time.perf_counter() - started
         SumoPlant._owner = self
         self._sumo = libsumo
@@ -97,6 +97,11 @@ class SumoPlant:
         self.sumo_time_s += time.perf_counter() - started
         self._sumo = None
         SumoPlant._owner = None
+
+    @classmethod
+    def is_open(cls) -> bool:
+        """Whether this process has a plant: libsumo takes one simulation at a time."""
+        return cls._owner is not None
 
     @property
     def version(self) -> str:
@@ -137,7 +142,7 @@ class SumoPlant:
             )
             return self._measure()
         except (self._sumo.TraCIException, self._sumo.FatalTraCIError) as error:
-            raise PlantError(f"SUMO broke off at {self.time_s:g} s ({_first_line(error)})") from error
+            raise PlantError(f"SUMO broke off at {self.time_s:g} s ({first_line(error)})") from error
 
     def redraw(self, onward: Callable[[int], list[str]], rng: np.random.Generator, speed_share: float) -> None:
         """Give every vehicle on the road a new future: another way, and a slightly other speed.
@@ -258,5 +263,6 @@ def run_arguments(
     ]  # fmt: skip
 
 
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
+    """What SUMO says of an error, without the rest."""
     return (str(error).splitlines() or [type(error).__name__])[0]

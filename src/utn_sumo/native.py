@@ -1,0 +1,130 @@
+"""`--controller native`: a scenario under the net's own signal programmes, measured as every other run is.
+
+Nothing is added to it but records, so that the trips are those of the bare `sumo` with the same seed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from utn_sumo import case, demand, metrics, network, recording
+from utn_sumo.case import Case
+from utn_sumo.errors import SettingError
+from utn_sumo.plant import untouched
+from utn_sumo.plant.sumo import write_outputs
+from utn_sumo.plant.untouched import Look
+from utn_sumo.scenario import Scenario
+
+NAME = "native"
+
+
+def run(
+    scenario: Scenario, folder: Path | None = None, on_look: Callable[[float, float, Look], None] | None = None
+) -> dict[str, Any]:
+    """Run it and return its measures under the names of SPEC 7; everything else is in the folder.
+
+    Queues and vehicles are the most on one road. What only our own links and signals have is null. `on_look` gets
+    the time into the run [s], how long it will be [s] (0 where that is unknown), and how full the roads are. Raises
+    UtnError.
+    """
+    started = time.perf_counter()
+    chosen = of(scenario)
+    folder = recording.new_folder(folder, f"{Path(scenario.net).name.partition('.')[0]}-{NAME}-seed{scenario.seed}")
+    recording.write_json(
+        folder / recording.SETTINGS,
+        {
+            "scenario": scenario.model_dump(),
+            "case": {
+                "net_file": str(chosen.net_file),
+                "begin_s": chosen.begin_s,
+                "end_s": chosen.end_s,
+                "teleport_s": chosen.teleport_s,
+                "options": dict(chosen.options),
+            },
+        },
+    )
+    outputs = folder / "outputs.add.xml"
+    write_outputs(outputs)
+
+    def look(seen: Look) -> None:
+        if on_look:
+            on_look(seen.time_s - chosen.begin_s, (chosen.end_s or chosen.begin_s) - chosen.begin_s, seen)
+
+    outcome = untouched.run(
+        [*chosen.arguments([outputs]), *_records(folder, scenario.seed)], chosen.begin_s, chosen.end_s, look
+    )
+    result = {
+        "controller": NAME,
+        "net": scenario.net,
+        "demand": scenario.demand,
+        "seed": scenario.seed,
+        "hours": (outcome.end_s - chosen.begin_s) / 3600,
+        **metrics.trip_measures(folder / "trips.xml"),
+        "max_queue_veh": outcome.max_queue_veh,
+        "max_vehicles_veh": outcome.max_vehicles_veh,
+        "over_storage_veh": None,
+        "teleports": metrics.teleports(folder / "statistics.xml"),
+        "gridlock": None,
+        "unsafe_signal_s": None,
+        "fallbacks": 0,
+        "sumo_time_s": outcome.sumo_time_s,
+        "control_time_s": 0.0,
+        "bridge_time_s": time.perf_counter() - started - outcome.sumo_time_s,
+        "interrupted": outcome.interrupted,
+        "out": str(folder),
+    }
+    recording.write_json(folder / recording.RESULT, result)
+    return result
+
+
+def of(scenario: Scenario) -> Case:
+    """The scenario's net and demand: of a .sumocfg its own, else a net with demand drawn as for every controller."""
+    if scenario.net.endswith(case.SUFFIX):
+        return _given(scenario)
+    net = network.load(scenario.net)
+    routes = demand.route_file(
+        net,
+        profile=scenario.profile,
+        duration_s=scenario.duration_s,
+        step_s=net.control_step_s,
+        scale=scenario.demand,
+        noise=scenario.noise,
+        seed=scenario.seed,
+        disturbance_veh_h=scenario.disturbance,
+    )
+    options = (("time-to-teleport", "-1"), ("max-depart-delay", "-1"))
+    return Case(net.net_file, net.net_file, (routes,), (), 0.0, scenario.duration_s, -1.0, options)
+
+
+def _given(scenario: Scenario) -> Case:
+    """A .sumocfg; `demand` scales all of its traffic, `hours` is the most of its window that is run."""
+    for name in ("profile", "noise", "disturbance"):
+        if name in scenario.model_fields_set:
+            value = getattr(scenario, name)
+            raise SettingError(f"setting {name!r} is {value!r}: {scenario.net!r} has a demand of its own, leave it out")
+    found = case.read(Path(scenario.net))
+    end_s = found.end_s
+    if "hours" in scenario.model_fields_set:
+        end_s = (
+            found.begin_s + scenario.duration_s if end_s is None else min(end_s, found.begin_s + scenario.duration_s)
+        )
+    options = found.options if scenario.demand == 1 else (*found.options, ("scale", f"{scenario.demand:g}"))
+    return replace(found, end_s=end_s, options=options)
+
+
+def _records(folder: Path, seed: int) -> list[str]:
+    return [
+        "--seed", str(seed),
+        "--tripinfo-output", str(folder / "trips.xml"),
+        "--tripinfo-output.write-unfinished",
+        "--tripinfo-output.write-undeparted",
+        "--statistic-output", str(folder / "statistics.xml"),
+        "--no-step-log",
+        "--duration-log.disable",
+        "--no-warnings",
+        "--error-log", str(folder / "sumo.log"),
+    ]  # fmt: skip

@@ -1,0 +1,158 @@
+"""Other people's scenarios under their own signals: measured by us as by the bare `sumo`."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pytest
+from click.testing import CliRunner
+
+from utn_sumo import bridge, case, demand
+from utn_sumo.cli import cli
+from utn_sumo.contract import Network
+from utn_sumo.errors import SettingError
+from utn_sumo.scenario import scenario
+from utn_sumo.sumo_tools import sumo_binary
+
+SCENARIOS = Path(__file__).parents[3] / "shared" / "scenarios"
+
+
+@pytest.fixture
+def town(utn17: Network, tmp_path: Path) -> Path:
+    """A .sumocfg of a quarter of an hour that begins at six, asks for outputs of its own and has an unusual option."""
+    drawn = demand.route_file(
+        utn17, profile="constant", duration_s=900, step_s=120, scale=0.8, noise=0.0, seed=4, cache=tmp_path / "cache"
+    )
+    tree = ET.parse(drawn)
+    for vehicle in tree.getroot():
+        vehicle.set("depart", f"{21600 + float(vehicle.attrib['depart']):.2f}")
+    tree.write(tmp_path / "town.rou.xml")
+    file = tmp_path / "town.sumocfg"
+    file.write_text(
+        f"""<configuration>
+        <input><net-file value="{utn17.net_file}"/><route-files value="town.rou.xml"/></input>
+        <time><begin value="6:00:00"/><end value="22500"/><step-length value="0.5"/></time>
+        <processing><time-to-teleport value="120"/></processing>
+        <output><tripinfo-output value="theirs.xml"/></output>
+        </configuration>""",
+        encoding="utf-8",
+    )
+    return file
+
+
+def trips(path: Path) -> dict[str, tuple[str, ...]]:
+    kept = ("depart", "departDelay", "duration", "timeLoss", "waitingCount", "arrival")
+    return {trip.attrib["id"]: tuple(trip.attrib[key] for key in kept) for trip in ET.parse(path).iter("tripinfo")}
+
+
+def by_bare_sumo(file: Path, folder: Path, seed: int) -> dict[str, tuple[str, ...]]:
+    out = folder / "bare.xml"
+    subprocess.run(
+        [
+            sumo_binary("sumo"),
+            *("-c", str(file), "--seed", str(seed), "--no-step-log", "--no-warnings", "--tripinfo-output", str(out)),
+            *("--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted"),
+        ],
+        check=True,
+        capture_output=True,
+    )
+    return trips(out)
+
+
+def test_trips_are_those_of_the_bare_sumo_vehicle_for_vehicle(town: Path, tmp_path: Path) -> None:
+    result = bridge.run(scenario(net=str(town), controller="native", seed=9), tmp_path / "run")
+    bare = by_bare_sumo(town, tmp_path, 9)
+    assert trips(tmp_path / "run" / "trips.xml") == bare
+    delays = [float(departure) + float(loss) for _, departure, _, loss, _, _ in bare.values()]
+    assert result["mean_delay_s"] == pytest.approx(sum(delays) / len(delays), rel=1e-6)
+    assert result["hours"] == 0.25
+    assert result["arrived"] + result["unfinished"] == len(bare)
+    # Its own outputs are not written where its files are.
+    assert not town.with_name("theirs.xml").exists()
+
+
+def test_what_its_configuration_says_is_honoured_and_shown(town: Path, tmp_path: Path) -> None:
+    found = case.read(town)
+    assert (found.begin_s, found.end_s, found.teleport_s) == (21600, 22500, 120)
+    assert ("step-length", "0.5") in found.options
+    bridge.run(scenario(net=str(town), controller="native", hours=0.1), tmp_path / "run")
+    shown = json.loads((tmp_path / "run" / "settings.json").read_text(encoding="utf-8"))["case"]
+    assert (shown["begin_s"], shown["end_s"], shown["teleport_s"]) == (21600, 21960, 120)
+
+
+def test_demand_scales_its_traffic(town: Path, tmp_path: Path) -> None:
+    once, half = (
+        bridge.run(scenario(net=str(town), controller="native", demand=scale), tmp_path / str(scale))
+        for scale in (1.0, 0.5)
+    )
+    vehicles = [result["arrived"] + result["unfinished"] for result in (once, half)]
+    assert vehicles[1] == pytest.approx(vehicles[0] / 2, rel=0.02)
+
+
+def test_without_an_end_it_runs_until_everybody_has_arrived(town: Path, tmp_path: Path) -> None:
+    town.write_text(town.read_text(encoding="utf-8").replace('<end value="22500"/>', ""), encoding="utf-8")
+    result = bridge.run(scenario(net=str(town), controller="native"), tmp_path / "run")
+    assert result["unfinished"] == 0
+    assert result["hours"] > 0.25
+
+
+def test_a_shipped_net_runs_under_its_own_signals_too(tmp_path: Path) -> None:
+    native = bridge.run(scenario(controller="native", hours=0.5, demand=0.6, seed=3), tmp_path / "native")
+    fixed = bridge.run(scenario(controller="fixed", hours=0.5, demand=0.6, seed=3), tmp_path / "fixed")
+    # The shipped programme is the equal split.
+    assert native["total_delay_veh_h"] == pytest.approx(fixed["total_delay_veh_h"], rel=1e-6)
+    assert native["total_time_spent_veh_h"] == pytest.approx(fixed["total_time_spent_veh_h"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "names", "remedy"),
+    [
+        (("town.rou.xml", "away.rou.xml"), "away.rou.xml", "no such file"),
+        (('value="22500"', 'value="noon"'), "end is 'noon'", "no time"),
+        (("<net-file", "<gnat-file"), "net-file", "whole .sumocfg"),
+        (("<configuration>", '<!DOCTYPE a [<!ENTITY b "c">]><configuration>'), "town.sumocfg", "give a .sumocfg"),
+        (("</configuration>", ""), "town.sumocfg", "give a .sumocfg"),
+    ],
+)
+def test_a_scenario_that_can_not_be_used_is_refused_in_one_line(
+    town: Path, change: tuple[str, str], names: str, remedy: str
+) -> None:
+    town.write_text(town.read_text(encoding="utf-8").replace(*change), encoding="utf-8")
+    with pytest.raises(SettingError, match=remedy) as caught:
+        case.read(town)
+    assert names in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "remedy"), [({"controller": "dmpc"}, "--controller native"), ({"noise": 0.2}, "leave it out")]
+)
+def test_what_other_people_s_demand_does_not_take_is_refused(
+    town: Path, tmp_path: Path, chosen: dict[str, Any], remedy: str
+) -> None:
+    with pytest.raises(SettingError, match=remedy):
+        bridge.run(scenario(**{"net": str(town), "controller": "native", **chosen}), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_command_takes_it_by_its_name_and_inspect_shows_its_net(town: Path, tmp_path: Path) -> None:
+    run = CliRunner().invoke(cli, ["run", str(town), "--controller", "native", "--out", str(tmp_path / "a")])
+    assert run.exit_code == 0
+    assert "not known" in run.stdout
+    shown = CliRunner().invoke(cli, ["inspect", str(town), "--out", str(tmp_path / "b"), "--json"])
+    assert len(json.loads(shown.stdout)["links"]) == 17
+
+
+@pytest.mark.parametrize(("name", "delay_s", "spread_s"), [("cologne8", 49.1, 1.0), ("ingolstadt7", 84.5, 8.0)])
+def test_published_delays_of_own_programmes_are_found_again(
+    name: str, delay_s: float, spread_s: float, tmp_path: Path
+) -> None:
+    file = SCENARIOS / name / f"{name}.sumocfg"
+    if not file.is_file():
+        pytest.skip(f"{file} is not here")
+    result = bridge.run(scenario(net=str(file), controller="native", seed=1), tmp_path / "run")
+    assert result["mean_delay_s"] == pytest.approx(delay_s, abs=spread_s)
