@@ -15,7 +15,7 @@ from utn_sumo import case, demand, metrics, network, recording
 from utn_sumo.case import Case
 from utn_sumo.errors import SettingError
 from utn_sumo.plant import untouched
-from utn_sumo.plant.sumo import write_outputs
+from utn_sumo.plant.sumo import records, write_outputs
 from utn_sumo.plant.untouched import Look
 from utn_sumo.scenario import Scenario
 
@@ -55,7 +55,7 @@ def run(
             on_look(seen.time_s - chosen.begin_s, (chosen.end_s or chosen.begin_s) - chosen.begin_s, seen)
 
     outcome = untouched.run(
-        [*chosen.arguments([outputs]), *_records(folder, scenario.seed)], chosen.begin_s, chosen.end_s, look
+        [*chosen.arguments([outputs]), *records(folder, scenario.seed)], chosen.begin_s, chosen.end_s, look
     )
     result = {
         "controller": NAME,
@@ -114,17 +114,3 @@ def _given(scenario: Scenario) -> Case:
         )
     options = found.options if scenario.demand == 1 else (*found.options, ("scale", f"{scenario.demand:g}"))
     return replace(found, end_s=end_s, options=options)
-
-
-def _records(folder: Path, seed: int) -> list[str]:
-    return [
-        "--seed", str(seed),
-        "--tripinfo-output", str(folder / "trips.xml"),
-        "--tripinfo-output.write-unfinished",
-        "--tripinfo-output.write-undeparted",
-        "--statistic-output", str(folder / "statistics.xml"),
-        "--no-step-log",
-        "--duration-log.disable",
-        "--no-warnings",
-        "--error-log", str(folder / "sumo.log"),
-    ]  # fmt: skip

@@ -248,10 +248,17 @@ def run_arguments(
         "--begin", "0",
         "--end", f"{duration_s:g}",
         "--step-length", "1",
-        "--seed", str(seed),
         "--time-to-teleport", "-1",
         "--collision.action", "warn",
         "--max-depart-delay", "-1",
+        *records(folder, seed),
+    ]  # fmt: skip
+
+
+def records(folder: Path, seed: int) -> list[str]:
+    """Options that make SUMO write down every trip, and nothing of its own to the screen."""
+    return [
+        "--seed", str(seed),
         "--tripinfo-output", str(folder / "trips.xml"),
         "--tripinfo-output.write-unfinished",
         "--tripinfo-output.write-undeparted",
