@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -69,6 +71,17 @@ def test_quasi_definite_systems_of_any_pattern_are_solved(size: int, rows: int, 
         substitute(factor[stack], inverse[stack], found.starts, found.rows, solution[stack])
     by_system = solution.swapaxes(1, 2).reshape(len(matrices), length)[:, found.position]
     assert by_system == pytest.approx(np.linalg.solve(matrices, right[..., None])[..., 0], abs=1e-9)
+
+
+def test_it_works_where_nothing_can_be_kept_on_disk() -> None:
+    code = (
+        "import numba.core.caching as caching; caching.CacheImpl._locator_classes = [];"
+        "import numpy as np; from utn_controllers.mpc.ldl import Factorisation, factorise;"
+        "found = Factorisation(np.ones((2, 2), dtype=bool)); diagonal = np.full((1, 2, 1), 2.0);"
+        "factorise(np.ones((1, 1, 1)), diagonal, found.starts, found.targets); print(diagonal.ravel())"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert answer.stdout.split() == ["[0.5", "0.66666667]"]
 
 
 @given(stages=st.integers(1, 6), seed=SEEDS)

@@ -8,10 +8,9 @@ agreed, since every round goes on from the last.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from utn_controllers.mpc.agent import NOWHERE, gram
-from utn_controllers.mpc.ldl import EXACT_ENOUGH, Factorisation, factorise, substitute
+from utn_controllers.mpc.ldl import Factorisation, compiled, factorise, substitute
 from utn_controllers.mpc.problem import Programs
 from utn_controllers.mpc.receding import RecedingProblem
 from utn_sumo.contract import Floats, Forecast, Ints, State
@@ -173,7 +172,7 @@ def nearest_split(green_s: Floats, least_s: Floats, budget_s: Floats) -> Floats:
     return np.asarray(least_s + np.maximum(over - np.take_along_axis(beyond, kept - 1, axis=-1), 0.0))
 
 
-@njit(cache=True, fastmath=EXACT_ENOUGH)
+@compiled
 def _sweep(
     system: tuple[Floats, Floats, Ints, Ints],
     statement: tuple[Floats, Floats, Floats, Floats],
@@ -209,7 +208,7 @@ def _sweep(
                 answer[stack, row, lane] = z[row, lane] * scale[row]
 
 
-@njit(cache=True, fastmath=EXACT_ENOUGH)
+@compiled
 def _state(right: Floats, by_row: tuple[Ints, Floats], cost: Floats, iterate: tuple[Floats, Floats, Floats]) -> None:
     """The system's right-hand side, in the factor's order."""
     position, penalty = by_row
@@ -227,7 +226,7 @@ def _state(right: Floats, by_row: tuple[Ints, Floats], cost: Floats, iterate: tu
                 own[lane] = bound[lane] - price[lane] * inverse
 
 
-@njit(cache=True, fastmath=EXACT_ENOUGH)
+@compiled
 def _follow(
     right: Floats, by_row: tuple[Ints, Floats], bounds: tuple[Floats, Floats], iterate: tuple[Floats, Floats, Floats]
 ) -> None:

@@ -7,6 +7,9 @@ their rows (Vanderbei 1995); no library does it for a batch on a processor.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sp
 from numba import njit
@@ -16,6 +19,14 @@ from utn_sumo.contract import Bools, Floats, Ints
 
 EXACT_ENOUGH = {"contract", "reassoc", "nsz", "arcp"}
 """What the compiler may do to sums and products; infinities keep their meaning."""
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """The function in machine code, kept on disk from one run to the next where there is a place for it."""
+    try:
+        return njit(cache=True, fastmath=EXACT_ENOUGH)(function)
+    except RuntimeError:  # neither the package's folder nor the user's can be written
+        return njit(fastmath=EXACT_ENOUGH)(function)
 
 
 class Factorisation:
@@ -56,7 +67,7 @@ class Factorisation:
         return np.asarray(self._at[np.maximum(first, second), np.minimum(first, second)])
 
 
-@njit(cache=True, fastmath=EXACT_ENOUGH)
+@compiled
 def factorise(lower: Floats, diagonal: Floats, starts: Ints, targets: Ints) -> None:
     """Turn the numbers of matrices into those of L and 1/D.
 
@@ -72,7 +83,7 @@ def factorise(lower: Floats, diagonal: Floats, starts: Ints, targets: Ints) -> N
             at = end
 
 
-@njit(cache=True, fastmath=EXACT_ENOUGH)
+@compiled
 def _eliminate(own: Floats, pivot: Floats, lower: Floats, diagonal: Floats, targets: Ints) -> None:
     """One column's numbers `own` out of the later ones, each pair's out of its target."""
     at = 0
@@ -92,7 +103,7 @@ def _eliminate(own: Floats, pivot: Floats, lower: Floats, diagonal: Floats, targ
     own[:] = scaled
 
 
-@njit(cache=True, fastmath=EXACT_ENOUGH)
+@compiled
 def substitute(lower: Floats, inverse: Floats, starts: Ints, rows: Ints, right: Floats) -> None:
     """Turn the right-hand sides `right` (n, lanes) of one stack, in the factor's order, into the solutions."""
     size, lanes = right.shape
