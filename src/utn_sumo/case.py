@@ -5,6 +5,7 @@ What SUMO is to write and to show is left out; that is ours to say.
 
 from __future__ import annotations
 
+import gzip
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +76,7 @@ def read(path: Path) -> Case:
         for each in found:
             if not each.is_file():
                 raise SettingError(f"scenario {str(path)!r} names {str(each)!r} as {name}: there is no such file")
+            _check(each, name)
         return found
 
     end_s = _seconds(path, "end", said["end"]) if "end" in said else -1.0
@@ -89,6 +91,20 @@ def read(path: Path) -> Case:
         teleport_s=_seconds(path, "time-to-teleport", said.get("time-to-teleport", str(DEFAULT_TELEPORT_S))),
         options=tuple((name, value) for name, value in said.items() if name not in OURS),
     )
+
+
+def _check(path: Path, name: str) -> None:
+    """Raise SettingError unless a file is whole XML that declares no entities: SUMO would read whatever it says."""
+    from defusedxml import ElementTree  # noqa: PLC0415
+    from defusedxml.common import DefusedXmlException  # noqa: PLC0415
+
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            for _, element in ElementTree.iterparse(file, forbid_dtd=True):
+                element.clear()
+    except (OSError, EOFError, ElementTree.ParseError, DefusedXmlException) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise SettingError(f"{name} {str(path)!r} can't be read ({reason}): give whole XML without entities") from error
 
 
 LONG = {"n": "net-file", "r": "route-files", "a": "additional-files", "b": "begin", "e": "end"}

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from utn_sumo import bridge, case, demand
 from utn_sumo.cli import cli
 from utn_sumo.contract import Network
-from utn_sumo.errors import SettingError
+from utn_sumo.errors import PlantError, SettingError
 from utn_sumo.scenario import scenario
 from utn_sumo.sumo_tools import sumo_binary
 
@@ -125,6 +125,24 @@ def test_a_scenario_that_can_not_be_used_is_refused_in_one_line(
     with pytest.raises(SettingError, match=remedy) as caught:
         case.read(town)
     assert names in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "routes", ["<routes><vehicle", '<!DOCTYPE a [<!ENTITY b "c">]><routes>&b;</routes>'], ids=["cut off", "entities"]
+)
+def test_files_of_a_scenario_are_looked_at_before_sumo_reads_them(town: Path, routes: str) -> None:
+    town.with_name("town.rou.xml").write_text(routes, encoding="utf-8")
+    with pytest.raises(SettingError, match=r"route-files .*town.rou.xml.* can't be read") as caught:
+        case.read(town)
+    assert "\n" not in str(caught.value)
+
+
+def test_routes_of_another_net_are_refused_in_one_line(town: Path, tmp_path: Path) -> None:
+    lost = '<routes><vehicle id="a" depart="21600"><route edges="nowhere"/></vehicle></routes>'
+    town.with_name("town.rou.xml").write_text(lost, encoding="utf-8")
+    with pytest.raises(PlantError, match="nowhere") as caught:
+        bridge.run(scenario(net=str(town), controller="native"), tmp_path / "run")
     assert "\n" not in str(caught.value)
 
 
