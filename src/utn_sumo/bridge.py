@@ -15,16 +15,19 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import utn_sumo
-from utn_sumo import calibration, case, controllers, demand, metrics, monitor, native, network, recording
+from utn_sumo import calibration, controllers, demand, metrics, monitor, native, network, recording, signals
+from utn_sumo.case import SUFFIX, Case
 from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
-from utn_sumo.errors import SettingError
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.sumo import SumoPlant
 from utn_sumo.plant.untouched import Look
 from utn_sumo.prediction import Predictor
 from utn_sumo.scenario import Scenario
 from utn_sumo.supervisor import Decision, Supervisor
+
+UNKNOWN_VEH = 1.0
+"""Vehicles that usually come onto a link amid it in a control step, where nobody says how many."""
 
 
 @dataclass(frozen=True)
@@ -46,33 +49,23 @@ def run(
     """
     if scenario.controller == native.NAME:
         return native.run(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
-    if scenario.net.endswith(case.SUFFIX):
-        raise SettingError(
-            f"setting 'controller' is {scenario.controller!r}: a {case.SUFFIX} runs under the net's own programmes so"
-            f" far, use --controller {native.NAME}, or give its net alone"
-        )
-    net = network.load(scenario.net)
+    chosen = native.given(scenario) if scenario.net.endswith(SUFFIX) else None
+    net = network.load(scenario.net) if chosen is None else controllable(str(chosen.net_file))
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.settings)
     step_s, duration_s = net.control_step_s, scenario.duration_s
+    if chosen is not None and chosen.end_s is not None:
+        duration_s = chosen.end_s - chosen.begin_s
     steps = int(np.ceil(duration_s / step_s))
-    drawn = demand.route_file(
-        net,
-        profile=scenario.profile,
-        duration_s=duration_s,
-        step_s=step_s,
-        scale=scenario.demand,
-        noise=scenario.noise,
-        seed=scenario.seed,
-        disturbance_veh_h=scenario.disturbance,
-    )
+    routes = chosen or _routes(scenario, net)
     folder = recording.new_folder(folder, _default_name(scenario))
-    routes = folder / "routes.rou.xml"
-    shutil.copyfile(drawn, routes)
-    shutil.copyfile(net.net_file, folder / "net.net.xml")
+    if isinstance(routes, Path):
+        routes = Path(shutil.copyfile(routes, folder / "routes.rou.xml"))
+        shutil.copyfile(net.net_file, folder / "net.net.xml")
     predictor = _predictor(net, scenario, routes, steps)
-    disturbance_veh = scenario.disturbance * scenario.demand * step_s / 3600
+    # Of other people's vehicles some start amid links, and nobody says how many.
+    disturbance_veh = scenario.disturbance * scenario.demand * step_s / 3600 if chosen is None else UNKNOWN_VEH
     estimator = Estimator(net, known, scenario.loop_error, disturbance_veh)
     miscount = Miscount(net, scenario.loop_error, scenario.seed)
     supervisor = Supervisor(net, controller)
@@ -108,6 +101,8 @@ def run(
                 waited = (before.source_queue_veh > 0) | (state.source_queue_veh > 0)
                 predictor.observe(seen.entered_veh.sum(axis=0), waited, state.disturbance_veh)
                 tally.add(decision, plant, np.bincount(net.turn_link, seen.turned_veh).astype(float))
+                if chosen is not None and chosen.end_s is None and plant.is_over:
+                    break
                 if on_cycle:
                     queue_veh = float(seen.queue_veh.sum() + state.source_queue_veh.sum())
                     on_cycle(Progress(plant.time_s, duration_s, tally.time_spent_veh_h, queue_veh))
@@ -115,7 +110,7 @@ def run(
             interrupted = True
         finally:
             recorder.close()
-    verdict = monitor.watch(net, folder / "signals.xml", plant.time_s)
+    verdict = monitor.watch(net, folder / "signals.xml", plant.time_s, plant.begin_s)
     trips = metrics.trip_measures(folder / "trips.xml")
     elapsed_s = time.perf_counter() - started
     result = {
@@ -136,6 +131,7 @@ def run(
         "control_time_s": tally.control_time_s,
         "bridge_time_s": elapsed_s - (plant.sumo_time_s - start_s) - tally.control_time_s,
         "interrupted": interrupted,
+        "left_alone": dict(net.left_alone),
         "unsafe_reasons": verdict.reasons[:20],
         "fallback_reasons": tally.fallback_reasons[:20],
         "out": str(folder),
@@ -148,16 +144,40 @@ def _progress(time_s: float, duration_s: float, seen: Look) -> Progress:
     return Progress(time_s, duration_s, seen.time_spent_veh_h, float(seen.halting_veh))
 
 
-def _predictor(net: Network, scenario: Scenario, routes: Path, steps: int) -> Predictor:
-    """What foretells the scenario's demand and disturbances; only a perfect forecast may look into the `routes`."""
-    profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
-    coming_veh = demand.coming_veh(net, routes, steps) if scenario.forecast == "perfect" else None
+def controllable(net_file: str) -> Network:
+    """A net as other people have it, with the signals left alone whose own stages can't be shown safely."""
+    net = network.load(net_file)
+    refused = signals.refused(net)
+    return network.load(net_file, refused) if refused else net
+
+
+def _routes(scenario: Scenario, net: Network) -> Path:
+    """The scenario's demand, drawn."""
+    return demand.route_file(
+        net,
+        profile=scenario.profile,
+        duration_s=scenario.duration_s,
+        step_s=net.control_step_s,
+        scale=scenario.demand,
+        noise=scenario.noise,
+        seed=scenario.seed,
+        disturbance_veh_h=scenario.disturbance,
+    )
+
+
+def _predictor(net: Network, scenario: Scenario, routes: Path | Case, steps: int) -> Predictor:
+    """What foretells demand and disturbances. Of other people's demand there is no profile, and no look ahead."""
+    profile_veh = coming_veh = None
+    if isinstance(routes, Path):
+        profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
+        profile_veh = profile_veh_h * net.control_step_s / 3600
+        coming_veh = demand.coming_veh(net, routes, steps) if scenario.forecast == "perfect" else None
     return Predictor(
         net,
         scenario.forecast,
-        profile_veh=profile_veh_h * net.control_step_s / 3600,
+        profile_veh=profile_veh,
         coming_veh=coming_veh,
-        disturbed=scenario.disturbance > 0,
+        disturbed=profile_veh is None or scenario.disturbance > 0,
         refit_steps=scenario.refit_steps,
         background=True,
     )

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from utn_sumo import signals
 from utn_sumo.contract import EXIT, Network
-from utn_sumo.errors import PlanError
 
 
 def inspect(network: Network) -> dict[str, Any]:
     """`junctions`, `links` and `left_alone`, under names that carry their units."""
+    refused = signals.refused(network)
     return {
         "net": network.name,
         "control_step_s": network.control_step_s,
-        "junctions": [_junction(network, index) for index in range(len(network.junctions))],
+        "junctions": [_junction(network, index, refused) for index in range(len(network.junctions))],
         "links": [_link(network, index) for index in range(len(network.links))],
         "left_alone": dict(network.left_alone),
     }
 
 
-def _junction(network: Network, index: int) -> dict[str, Any]:
+def _junction(network: Network, index: int, refused: Mapping[str, str]) -> dict[str, Any]:
     junction, part = network.junctions[index], network.part(index)
-    refused = ""
-    try:
-        signals.admit(part.equal_split(), part)
-    except PlanError as error:
-        refused = str(error).removeprefix(f"junction {junction.id}: ")
     return {
         "id": junction.id,
         "cycle_s": junction.cycle_s,
@@ -35,7 +31,7 @@ def _junction(network: Network, index: int) -> dict[str, Any]:
         "green_budget_s": float(part.green_budget_s[0]),
         "min_green_s": junction.min_green_s,
         "links": [link.id for link in part.links],
-        "refused": refused,
+        "refused": refused.get(junction.id, ""),
     }
 
 

@@ -38,8 +38,8 @@ class Verdict:
             self.reasons.append(f"{junction} at {second} s: {reason}")
 
 
-def watch(network: Network, switches: Path, duration_s: float) -> Verdict:
-    """Judge a run by its record of signal switches (SUMO's SaveTLSSwitchStates).
+def watch(network: Network, switches: Path, duration_s: float, begin_s: float = 0.0) -> Verdict:
+    """Judge a run that began at `begin_s` by its record of signal switches (SUMO's SaveTLSSwitchStates).
 
     Unsafe is: two conflicting streams with a protected green or with green against yellow; a green that ends
     without its full yellow; a conflicting green before the clearance that the net prescribes has run; a green
@@ -48,7 +48,8 @@ def watch(network: Network, switches: Path, duration_s: float) -> Verdict:
     shown = read_switches(switches)
     verdict = Verdict()
     for junction in network.junctions:
-        _Guard(network, junction, verdict).judge(_stretches(shown.get(junction.id, []), int(duration_s)))
+        switched = [(second - int(begin_s), state) for second, state in shown.get(junction.id, [])]
+        _Guard(network, junction, verdict, begin_s).judge(_stretches(switched, int(duration_s)))
     return verdict
 
 
@@ -75,10 +76,12 @@ def _stretches(switches: list[tuple[int, str]], duration_s: int) -> list[tuple[s
 class _Guard:
     """Follows the signals of one junction through the seconds of a run."""
 
-    def __init__(self, network: Network, junction: Junction, verdict: Verdict) -> None:
+    def __init__(self, network: Network, junction: Junction, verdict: Verdict, begin_s: float) -> None:
         clearances = [network.stages[stage].clearance for stage in junction.stages]
         self.junction = junction
         self.verdict = verdict
+        self.under_way = (junction.offset_s - begin_s) % junction.cycle_s > 0
+        """Whether a cycle is under way when the run begins: how long its green has lasted nobody saw."""
         self.clearance_s = min(sum(seconds for _, seconds in clearance) for clearance in clearances)
         self.yellow_s = min(sum(seconds for state, seconds in clearance if "y" in state) for clearance in clearances)
         size = len(junction.conflicts)
@@ -113,9 +116,7 @@ class _Guard:
     def _change(self, signal: int, was: str, now: str, second: int, state: str) -> str:
         """What is wrong with one signal's change at this second; empty if nothing is."""
         if now in GREEN and was not in GREEN:
-            # A cycle with an offset is under way when the run begins: how long its green has lasted nobody saw.
-            under_way = second == 0 and self.junction.offset_s % self.junction.cycle_s > 0
-            self.green_since[signal] = LONG_AGO_S if under_way else second
+            self.green_since[signal] = LONG_AGO_S if second == 0 and self.under_way else second
             for foe in self.foes[signal]:
                 if now == "G" and state[foe] == "r" and second - self.last_green[foe] - 1 < self.clearance_s:
                     return f"turns green too soon after signal {foe}"

@@ -84,7 +84,7 @@ def run(
 def of(scenario: Scenario) -> Case:
     """The scenario's net and demand: of a .sumocfg its own, else a net with demand drawn as for every controller."""
     if scenario.net.endswith(case.SUFFIX):
-        return _given(scenario)
+        return given(scenario)
     net = network.load(scenario.net)
     routes = demand.route_file(
         net,
@@ -100,8 +100,8 @@ def of(scenario: Scenario) -> Case:
     return Case(net.net_file, net.net_file, (routes,), (), 0.0, scenario.duration_s, -1.0, options)
 
 
-def _given(scenario: Scenario) -> Case:
-    """A .sumocfg; `demand` scales all of its traffic, `hours` is the most of its window that is run."""
+def given(scenario: Scenario) -> Case:
+    """The case of a .sumocfg; `demand` scales all of its traffic, `hours` is the most of its window that is run."""
     for name in ("profile", "noise", "disturbance"):
         if name in scenario.model_fields_set:
             value = getattr(scenario, name)

@@ -28,8 +28,10 @@ STARTUP_LAG_S = 3.0
 MIN_GREEN_S = 10.0
 
 
-def load(name: str) -> Network:
+def load(name: str, left_alone: Mapping[str, str] | None = None) -> Network:
     """The shipped network `name`, or the one in the .net.xml file that `name` is a path of.
+
+    Signals in `left_alone` keep the net's own programme, for the reason given there.
 
     Turning fractions are read from NAME.turns.xml beside the net (SUMO's edgeRelations); without the file every
     lane-to-lane connection of a link is taken to carry the same share.
@@ -40,10 +42,10 @@ def load(name: str) -> Network:
     if not path.is_file():
         known = did_you_mean(name, utn_network.names())
         raise NetworkError(f"net {name!r}: neither a shipped net nor a file; {known}")
-    return read(path, path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net"))
+    return read(path, path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net"), left_alone)
 
 
-def read(path: Path, name: str) -> Network:
+def read(path: Path, name: str, excluded: Mapping[str, str] | None = None) -> Network:
     """Read one net file. Raises NetworkError with one line if it can't be used."""
     import sumolib  # noqa: PLC0415 - heavy, and only this door needs it
 
@@ -60,7 +62,8 @@ def read(path: Path, name: str) -> Network:
     signals = sorted(net.getTrafficLights(), key=lambda tls: _natural(tls.getID()))
     if not signals:
         raise NetworkError(f"net {str(path)!r} has no traffic lights: there is nothing to control")
-    left_alone = {tls.getID(): reason for tls in signals if (reason := _why_left_alone(tls))}
+    reasons_of = {tls.getID(): (excluded or {}).get(tls.getID()) or _why_left_alone(tls) for tls in signals}
+    left_alone = {signal: reason for signal, reason in reasons_of.items() if reason}
     controlled = [tls for tls in signals if tls.getID() not in left_alone]
     if not controlled:
         reasons = "; ".join(f"{signal}: {reason}" for signal, reason in left_alone.items())

@@ -47,6 +47,18 @@ def admit(plan: Plan, network: Network) -> Plan:
     return admitted
 
 
+def refused(network: Network) -> dict[str, str]:
+    """Junctions whose cycle can't be shared out equally without breaking the rules of `admit`, and why."""
+    found = {}
+    for index, junction in enumerate(network.junctions):
+        part = network.part(index)
+        try:
+            admit(part.equal_split(), part)
+        except PlanError as error:
+            found[junction.id] = str(error).removeprefix(f"junction {junction.id}: ")
+    return found
+
+
 def whole_seconds(network: Network, green_s: Floats) -> Floats:
     """Greens rounded to whole seconds that still sum to each junction's budget (largest remainder)."""
     rounded = np.floor(green_s + TOLERANCE_S)

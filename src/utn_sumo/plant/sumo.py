@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -18,6 +18,7 @@ from typing import Any, Self
 import numpy as np
 
 from utn_sumo import detectors
+from utn_sumo.case import Case
 from utn_sumo.contract import SAMPLE_S, Floats, Measurement, Network, Plan
 from utn_sumo.errors import PlantError
 from utn_sumo.signals import cycle_phases
@@ -50,21 +51,26 @@ class SumoPlant:
 
     _owner: SumoPlant | None = None
 
-    def __init__(self, network: Network, routes: Path, folder: Path, *, seed: int, duration_s: float):
-        """`folder` takes SUMO's own outputs: trips.xml, signals.xml (every switch), sumo.log."""
+    def __init__(self, network: Network, routes: Path | Case, folder: Path, *, seed: int, duration_s: float):
+        """`folder` takes SUMO's own outputs: trips.xml, signals.xml (every switch), sumo.log.
+
+        With a case for `routes` its files, its window's begin and its other options are SUMO's; times count from there.
+        """
         self.network = network
         self.routes = routes
         self.folder = folder
         self.seed = seed
         self.duration_s = duration_s
         self.time_s = 0.0
+        self.begin_s = routes.begin_s if isinstance(routes, Case) else 0.0
+        """SUMO's time at our 0."""
         self.sumo_time_s = 0.0
         """Wall time spent inside SUMO: start, steps, close."""
         self.truth: Truth | None = None
         self._ids = detectors.ids(network)
         self._entered: list[tuple[float, Floats]] = []
         """(time, what the entry loops have counted since the control step began) at each reading."""
-        self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
+        self._boundary_s = [(junction.offset_s - self.begin_s) % junction.cycle_s for junction in network.junctions]
         self._sumo: Any = None
 
     def __enter__(self) -> Self:
@@ -76,9 +82,7 @@ class SumoPlant:
         additional = [self.folder / "detectors.add.xml", self.folder / "outputs.add.xml"]
         detectors.write(self.network, additional[0], self.network.control_step_s)
         write_outputs(additional[1])
-        arguments = run_arguments(
-            self.network.net_file, self.routes, additional, self.folder, seed=self.seed, duration_s=self.duration_s
-        )
+        arguments = self._arguments(additional)
         started = time.perf_counter()
         try:
             libsumo.start(["sumo", *arguments])
@@ -88,6 +92,14 @@ class SumoPlant:
         SumoPlant._owner = self
         self._sumo = libsumo
         return self
+
+    def _arguments(self, additional: list[Path]) -> list[str]:
+        if isinstance(self.routes, Case):
+            window = replace(self.routes, end_s=self.begin_s + self.duration_s)
+            return [*window.arguments(additional), *records(self.folder, self.seed)]
+        return run_arguments(
+            self.network.net_file, self.routes, additional, self.folder, seed=self.seed, duration_s=self.duration_s
+        )
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -102,6 +114,11 @@ class SumoPlant:
     def is_open(cls) -> bool:
         """Whether this process has a plant: libsumo takes one simulation at a time."""
         return cls._owner is not None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nobody is on the road, or will be."""
+        return int(self._sumo.simulation.getMinExpectedNumber()) == 0
 
     @property
     def version(self) -> str:
@@ -173,7 +190,7 @@ class SumoPlant:
 
     def _step(self) -> None:
         started = time.perf_counter()
-        self._sumo.simulationStep(self.time_s)
+        self._sumo.simulationStep(self.begin_s + self.time_s)
         self.sumo_time_s += time.perf_counter() - started
 
     def _hand_over(self, index: int, green_s: Floats) -> None:
