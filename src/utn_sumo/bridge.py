@@ -50,7 +50,7 @@ def run(
     if scenario.controller == native.NAME:
         return native.run(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
     chosen = native.given(scenario) if scenario.net.endswith(SUFFIX) else None
-    net = network.load(scenario.net) if chosen is None else controllable(str(chosen.net_file))
+    net = network.load(scenario.net) if chosen is None else controllable(chosen)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.settings)
@@ -144,11 +144,12 @@ def _progress(time_s: float, duration_s: float, seen: Look) -> Progress:
     return Progress(time_s, duration_s, seen.time_spent_veh_h, float(seen.halting_veh))
 
 
-def controllable(net_file: str) -> Network:
+def controllable(chosen: Case) -> Network:
     """A net as other people have it, with the signals left alone whose own stages can't be shown safely."""
-    net = network.load(net_file)
+    name, additional = str(chosen.net_file), chosen.additional_files
+    net = network.load(name, None, additional)
     refused = signals.refused(net)
-    return network.load(net_file, refused) if refused else net
+    return network.load(name, refused, additional) if refused else net
 
 
 def _routes(scenario: Scenario, net: Network) -> Path:

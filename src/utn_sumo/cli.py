@@ -45,7 +45,7 @@ def cli() -> None:
 def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bool, **flags: str | None) -> None:
     """Run a controller on a network in SUMO and measure it.
 
-    CASE is a .sumocfg of your own, with net and demand; it runs with --controller native so far.
+    CASE is a .sumocfg of your own, with net and demand.
     """
     from utn_sumo import bridge, report  # noqa: PLC0415 - heavy
     from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy

@@ -22,6 +22,8 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 EXIT = -1
+MOST_STEP_S = 360.0
+"""Longest time between two decisions that junctions with different cycles make necessary."""
 SAMPLE_S = 10.0
 """Longest time between two readings of the entry loops (the paper's sampling interval)."""
 
@@ -244,8 +246,13 @@ class Network:
 
     @property
     def control_step_s(self) -> float:
-        """Time between two decisions: the least common multiple of the cycles (SPEC 2.7, N = 1)."""
-        return self.whole_step_s or float(np.lcm.reduce(self.cycle_s.astype(np.int64)))
+        """Time between two decisions: the least common multiple of the cycles (SPEC 2.7, N = 1).
+
+        Where that is beyond `MOST_STEP_S` it is the longest cycle: plans are then handed over where each junction's
+        cycle begins, wherever in the step that is.
+        """
+        multiple = float(np.lcm.reduce(self.cycle_s.astype(np.int64)))
+        return self.whole_step_s or (multiple if multiple <= MOST_STEP_S else float(self.cycle_s.max()))
 
     @property
     def samples(self) -> int:

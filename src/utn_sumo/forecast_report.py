@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from utn_sumo import demand, network, recording
+from utn_sumo.case import SUFFIX
 from utn_sumo.contract import Floats, Network
 from utn_sumo.errors import SettingError
 from utn_sumo.prediction.predictor import ADOPTED_AFTER, LEAST_ROWS, METHODS, Predictor
@@ -34,6 +35,8 @@ def rmse_veh_h(folder: Path, horizon: int, refit_steps: int) -> dict[str, list[f
     Raises ResultError for a folder that holds no run, SettingError for a run that is too short.
     """
     scenario = Scenario(**recording.read_json(folder, recording.SETTINGS)["scenario"])
+    if scenario.net.endswith(SUFFIX):
+        raise SettingError(f"setting 'net' is {scenario.net!r}: forecasts are judged where the demand was drawn")
     net = network.load(scenario.net)
     log = recording.read_log(folder)
     steps = len(log.green_s)

@@ -456,6 +456,13 @@ def green_windows(network: Network, green_s: Floats, step_s: float) -> GreenWind
     begin = np.arange(steps)[:, None, None] * step_s
     closes = np.minimum((start + green_s[..., None, :])[..., None, :, :], begin + step_s) - begin
     overlap = np.maximum(closes - np.maximum(start[..., None, :, :] - begin, 0.0), 0.0)
+    # Cycles that do not divide the control step begin elsewhere in every one: what they show on average counts.
+    odd = network.control_step_s % network.cycle_s[network.stage_junction] > 0
+    if odd.any():
+        usual = green_s * network.control_step_s / network.cycle_s[network.stage_junction]
+        shown = overlap.sum(axis=(-3, -2))
+        scale = np.where(odd, usual / np.maximum(shown, 1e-9), 1.0)
+        overlap = overlap * scale[..., None, None, :]
     last = np.where(overlap > 0, closes, 0.0).max(axis=-2)
     stages, starts, turns = network.turn_stages
     by_turn = np.zeros((*last.shape[:-1], len(network.turns)))

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import gzip
 import math
-from collections.abc import Mapping
-from itertools import pairwise
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,11 @@ STARTUP_LAG_S = 3.0
 MIN_GREEN_S = 10.0
 
 
-def load(name: str, left_alone: Mapping[str, str] | None = None) -> Network:
+def load(name: str, left_alone: Mapping[str, str] | None = None, additional: Sequence[Path] = ()) -> Network:
     """The shipped network `name`, or the one in the .net.xml file that `name` is a path of.
 
-    Signals in `left_alone` keep the net's own programme, for the reason given there.
+    Signals in `left_alone` keep the net's own programme, for the reason given there. Signal programmes in `additional`
+    files stand for the net's own, the last one read for each signal, as in SUMO.
 
     Turning fractions are read from NAME.turns.xml beside the net (SUMO's edgeRelations); without the file every
     lane-to-lane connection of a link is taken to carry the same share.
@@ -42,10 +44,10 @@ def load(name: str, left_alone: Mapping[str, str] | None = None) -> Network:
     if not path.is_file():
         known = did_you_mean(name, utn_network.names())
         raise NetworkError(f"net {name!r}: neither a shipped net nor a file; {known}")
-    return read(path, path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net"), left_alone)
+    return read(path, path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net"), left_alone, additional)
 
 
-def read(path: Path, name: str, excluded: Mapping[str, str] | None = None) -> Network:
+def read(path: Path, name: str, excluded: Mapping[str, str] | None = None, additional: Sequence[Path] = ()) -> Network:
     """Read one net file. Raises NetworkError with one line if it can't be used."""
     import sumolib  # noqa: PLC0415 - heavy, and only this door needs it
 
@@ -62,13 +64,59 @@ def read(path: Path, name: str, excluded: Mapping[str, str] | None = None) -> Ne
     signals = sorted(net.getTrafficLights(), key=lambda tls: _natural(tls.getID()))
     if not signals:
         raise NetworkError(f"net {str(path)!r} has no traffic lights: there is nothing to control")
-    reasons_of = {tls.getID(): (excluded or {}).get(tls.getID()) or _why_left_alone(tls) for tls in signals}
+    programmes = {tls.getID(): _own_programme(tls) for tls in signals} | _programmes_in(additional)
+    reasons_of = {
+        tls.getID(): (excluded or {}).get(tls.getID()) or _why_left_alone(programmes[tls.getID()]) for tls in signals
+    }
     left_alone = {signal: reason for signal, reason in reasons_of.items() if reason}
     controlled = [tls for tls in signals if tls.getID() not in left_alone]
     if not controlled:
         reasons = "; ".join(f"{signal}: {reason}" for signal, reason in left_alone.items())
         raise NetworkError(f"net {str(path)!r} has no signals that can be controlled ({reasons})")
-    return _Reader(net, controlled, _read_fractions(path)).network(path.resolve(), name, left_alone)
+    reader = _Reader(net, controlled, programmes, _read_fractions(path))
+    return reader.network(path.resolve(), name, left_alone)
+
+
+@dataclass(frozen=True)
+class Programme:
+    """A signal programme: its phases as (letters, seconds), those alike in a row as one."""
+
+    phases: tuple[tuple[str, float], ...]
+    offset_s: float
+
+    @classmethod
+    def of(cls, phases: Iterable[tuple[str, float]], offset_s: float) -> Programme:
+        """Of the phases as they are written."""
+        grouped = groupby(phases, key=lambda phase: phase[0])
+        return cls(tuple((state, sum(seconds for _, seconds in group)) for state, group in grouped), offset_s)
+
+
+def _own_programme(tls: Any) -> Programme | None:
+    """The net's own for a signal, if it has one."""
+    program = next(iter(tls.getPrograms().values()), None)
+    if program is None:
+        return None
+    return Programme.of(((phase.state, float(phase.duration)) for phase in program.getPhases()), program.getOffset())
+
+
+def _programmes_in(files: Sequence[Path]) -> dict[str, Programme]:
+    """Signal programmes in additional files, by signal."""
+    from defusedxml import ElementTree  # noqa: PLC0415
+
+    found = {}
+    for file in files:
+        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as content:
+            logics = [logic for logic in ElementTree.parse(content).iter("tlLogic") if logic.find("phase") is not None]
+        for logic in logics:
+            try:
+                shown = [(phase.get("state", ""), float(phase.get("duration", ""))) for phase in logic.iter("phase")]
+                found[logic.get("id")] = Programme.of(shown, float(logic.get("offset", "0")))
+            except ValueError as error:
+                raise NetworkError(
+                    f"additional file {str(file)!r}: the programme of {logic.get('id')!r} has times that are no numbers"
+                    f" ({error}): give seconds"
+                ) from error
+    return found
 
 
 def shapes(path: Path) -> dict[str, list[tuple[float, float]]]:
@@ -78,12 +126,11 @@ def shapes(path: Path) -> dict[str, list[tuple[float, float]]]:
     return {edge.getID(): list(edge.getShape()) for edge in sumolib.net.readNet(str(path)).getEdges()}
 
 
-def _why_left_alone(tls: Any) -> str:
+def _why_left_alone(programme: Programme | None) -> str:
     """Why a signal can't be controlled; empty if it can."""
-    program = next(iter(tls.getPrograms().values()), None)
-    if program is None:
+    if programme is None:
         return "it has no signal programme, as rail signals have none"
-    greens = sum(_is_green(phase.state) for phase in program.getPhases())
+    greens = sum(_is_green(state) for state, _ in programme.phases)
     if greens == 0:
         return "no phase of its programme shows green without yellow"
     return "its programme has one stage: there is nothing to share out" if greens == 1 else ""
@@ -111,8 +158,15 @@ def _refuse_entities(path: Path) -> None:
 class _Reader:
     """Builds the index spaces in the order links, turns, stages, junctions."""
 
-    def __init__(self, net: Any, signals: list[Any], fractions: dict[tuple[str, str], float]):
+    def __init__(
+        self,
+        net: Any,
+        signals: list[Any],
+        programmes: Mapping[str, Programme | None],
+        fractions: dict[tuple[str, str], float],
+    ):
         self.net = net
+        self.programmes = programmes
         self.signals = signals
         self.fractions = fractions
         # Approach edge -> position of the junction that it enters.
@@ -136,16 +190,17 @@ class _Reader:
         junctions: list[Junction] = []
         for position, tls in enumerate(self.signals):
             signal_turn = self._signal_turns(tls, turn_index)
-            program = next(iter(tls.getPrograms().values()))
-            phases, begin_s = _from_first_green(program.getPhases())
+            programme = self.programmes[tls.getID()]
+            assert programme is not None
+            phases, begin_s = _from_first_green(programme.phases)
             first = len(stages)
             stages += _stages(phases, position, signal_turn)
             junctions.append(
                 Junction(
                     id=tls.getID(),
                     stages=tuple(range(first, len(stages))),
-                    cycle_s=sum(phase.duration for phase in phases),
-                    offset_s=float(program.getOffset()) + begin_s,
+                    cycle_s=sum(seconds for _, seconds in phases),
+                    offset_s=float(programme.offset_s) + begin_s,
                     min_green_s=MIN_GREEN_S,
                     signal_turn=tuple(signal_turn),
                     conflicts=self._conflicts(tls, len(signal_turn)),
@@ -248,20 +303,20 @@ class _Reader:
         return tuple(tuple(row) for row in matrix)
 
 
-def _from_first_green(phases: list[Any]) -> tuple[list[Any], float]:
+def _from_first_green(phases: Sequence[tuple[str, float]]) -> tuple[list[tuple[str, float]], float]:
     """A programme's phases from its first green one on, round the cycle, and when in the cycle that one begins [s]."""
-    first = next(index for index, phase in enumerate(phases) if _is_green(phase.state))
-    return [*phases[first:], *phases[:first]], float(sum(phase.duration for phase in phases[:first]))
+    first = next(index for index, (state, _) in enumerate(phases) if _is_green(state))
+    return [*phases[first:], *phases[:first]], float(sum(seconds for _, seconds in phases[:first]))
 
 
-def _stages(phases: list[Any], junction: int, signal_turn: list[int]) -> list[Stage]:
+def _stages(phases: list[tuple[str, float]], junction: int, signal_turn: list[int]) -> list[Stage]:
     """Cut a programme that opens with green into stages: a green phase with the phases up to the next green one."""
-    starts = [i for i, phase in enumerate(phases) if _is_green(phase.state)]
+    starts = [i for i, (state, _) in enumerate(phases) if _is_green(state)]
     stages = []
     for start, end in pairwise([*starts, len(phases)]):
-        green = phases[start].state
+        green = phases[start][0]
         served = {signal_turn[i] for i, letter in enumerate(green) if letter in "Gg" and signal_turn[i] >= 0}
-        clearance = tuple((phase.state, float(phase.duration)) for phase in phases[start + 1 : end])
+        clearance = tuple(phases[start + 1 : end])
         stages.append(Stage(junction, green, clearance, tuple(sorted(served))))
     return stages
 

@@ -27,6 +27,8 @@ def write(folder: Path) -> Path:
         seed, duration_s = int(settings["scenario"]["seed"]), round(result["hours"] * 3600)
     except (KeyError, TypeError, ValueError) as error:
         raise ResultError(f"{str(folder)!r} lacks a run's seed or length: give one that `utn run` wrote") from error
+    if not (folder / "routes.rou.xml").is_file():
+        raise ResultError(f"{str(folder)!r} holds no routes: runs of a .sumocfg can't be replayed yet")
     target = folder / FOLDER
     if target.exists():
         raise ResultError(f"{str(target)!r} is there already: remove it to write the replay anew")

@@ -99,7 +99,8 @@ def check_programme(network: Network, junction: int, phases: list[tuple[str, flo
 
 
 def _refuse_conflict(junction: Junction, state: str) -> None:
-    greens = [signal for signal, letter in enumerate(state) if letter == "G"]
-    for a, b in combinations(greens, 2):
-        if junction.conflicts[a][b]:
-            raise PlanError(f"junction {junction.id}: signals {a} and {b} conflict and are both green")
+    open_ = [signal for signal, letter in enumerate(state) if letter in "Gy"]
+    for a, b in combinations(open_, 2):
+        if junction.conflicts[a][b] and "G" in state[a] + state[b]:
+            both = "are both green" if state[a] == state[b] else "are open together, one of them still clearing"
+            raise PlanError(f"junction {junction.id}: signals {a} and {b} conflict and {both}")

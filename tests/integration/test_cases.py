@@ -11,10 +11,10 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from utn_sumo import bridge, case, demand
+from utn_sumo import bridge, case, demand, forecast_report, replay
 from utn_sumo.cli import cli
 from utn_sumo.contract import Network
-from utn_sumo.errors import PlantError, SettingError
+from utn_sumo.errors import PlantError, ResultError, SettingError
 from utn_sumo.scenario import scenario
 from utn_sumo.sumo_tools import sumo_binary
 
@@ -147,14 +147,81 @@ def test_routes_of_another_net_are_refused_in_one_line(town: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("chosen", "remedy"), [({"controller": "dmpc"}, "--controller native"), ({"noise": 0.2}, "leave it out")]
+    ("chosen", "remedy"), [({"forecast": "perfect"}, "drawn demand"), ({"noise": 0.2}, "leave it out")]
 )
 def test_what_other_people_s_demand_does_not_take_is_refused(
     town: Path, tmp_path: Path, chosen: dict[str, Any], remedy: str
 ) -> None:
     with pytest.raises(SettingError, match=remedy):
-        bridge.run(scenario(**{"net": str(town), "controller": "native", **chosen}), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+        bridge.run(scenario(net=str(town), controller="fixed", **chosen), tmp_path / "run")
+    assert not (tmp_path / "run" / "result.json").exists()
+
+
+@pytest.mark.parametrize("controller", ["fixed", "dmpc", "cmpc"])
+def test_controllers_run_it_within_its_window(town: Path, tmp_path: Path, controller: str) -> None:
+    result = bridge.run(scenario(net=str(town), controller=controller, seed=9), tmp_path / "run")
+    assert (result["unsafe_signal_s"], result["fallbacks"], result["hours"]) == (0, 0, 0.25)
+    assert set(trips(tmp_path / "run" / "trips.xml")) == set(by_bare_sumo(town, tmp_path, 9))
+
+
+def test_a_scenario_with_the_demand_that_is_drawn_here_gives_the_same_run(utn17: Network, tmp_path: Path) -> None:
+    chosen = scenario(controller="fixed", hours=0.5, demand=0.6, seed=3)
+    ours = bridge.run(chosen, tmp_path / "ours")
+    (tmp_path / "theirs.sumocfg").write_text(
+        f"""<configuration><input><net-file value="{utn17.net_file}"/><route-files value="ours/routes.rou.xml"/></input>
+        <time><begin value="0"/><end value="1800"/></time>
+        <processing><time-to-teleport value="-1"/></processing></configuration>""",
+        encoding="utf-8",
+    )
+    theirs = bridge.run(scenario(net=str(tmp_path / "theirs.sumocfg"), controller="fixed", seed=3), tmp_path / "theirs")
+    for name in ("total_delay_veh_h", "arrived", "unfinished", "stops", "max_queue_veh"):
+        assert theirs[name] == ours[name], name
+
+
+def test_programmes_in_additional_files_stand_for_the_nets(town: Path, tmp_path: Path) -> None:
+    phases = "".join(
+        f'<phase duration="{seconds}" state="{state}"/>'
+        for seconds, state in (
+            (20, "GGGrrr"),
+            (10, "GGGrrr"),
+            (3, "yyyrrr"),
+            (2, "rrrrrr"),
+            (30, "rrrGGG"),
+            (5, "rrryyy"),
+        )
+    )
+    added = f'<additional><tlLogic id="J2" programID="b" type="static" offset="4">{phases}</tlLogic></additional>'
+    town.with_name("own.add.xml").write_text(added, encoding="utf-8")
+    text = town.read_text(encoding="utf-8").replace("</input>", '<additional-files value="own.add.xml"/></input>')
+    town.write_text(text, encoding="utf-8")
+    net = bridge.controllable(case.read(town))
+    junction = net.junctions[1]
+    assert (junction.cycle_s, junction.offset_s, len(junction.stages)) == (70, 4, 2)
+    # 70 s and 120 s have no common multiple that is worth waiting for: the longest cycle is the step.
+    assert net.control_step_s == 120
+    result = bridge.run(scenario(net=str(town), controller="dmpc"), tmp_path / "run")
+    assert (result["unsafe_signal_s"], result["fallbacks"]) == (0, 0)
+
+
+def test_a_junction_whose_own_stages_conflict_is_left_alone_and_named(town: Path, tmp_path: Path) -> None:
+    clash = '<phase duration="60" state="GGGGGG"/><phase duration="3" state="yyyyyy"/>'
+    more = '<phase duration="50" state="rrrGGG"/><phase duration="7" state="rrryyy"/>'
+    added = f'<additional><tlLogic id="J2" programID="b" type="static" offset="0">{clash}{more}</tlLogic></additional>'
+    town.with_name("own.add.xml").write_text(added, encoding="utf-8")
+    text = town.read_text(encoding="utf-8").replace("</input>", '<additional-files value="own.add.xml"/></input>')
+    town.write_text(text, encoding="utf-8")
+    result = bridge.run(scenario(net=str(town), controller="fixed"), tmp_path / "run")
+    assert set(result["left_alone"]) == {"J2"}
+    assert "conflict" in result["left_alone"]["J2"]
+    assert (result["unsafe_signal_s"], result["fallbacks"]) == (0, 0)
+
+
+def test_its_runs_are_not_replayed_and_their_forecasts_not_judged(town: Path, tmp_path: Path) -> None:
+    bridge.run(scenario(net=str(town), controller="fixed"), tmp_path / "run")
+    with pytest.raises(ResultError, match="no routes"):
+        replay.write(tmp_path / "run")
+    with pytest.raises(SettingError, match="drawn"):
+        forecast_report.rmse_veh_h(tmp_path / "run", 7, 15)
 
 
 def test_the_command_takes_it_by_its_name_and_inspect_shows_its_net(town: Path, tmp_path: Path) -> None:
