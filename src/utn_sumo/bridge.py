@@ -15,7 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import utn_sumo
-from utn_sumo import calibration, controllers, demand, metrics, monitor, native, network, recording, signals
+from utn_sumo import calibration, controllers, demand, metrics, monitor, native, network, recording, signals, traffic
 from utn_sumo.case import SUFFIX, Case
 from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
@@ -49,7 +49,7 @@ def run(
     """
     if scenario.controller == native.NAME:
         return native.run(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
-    chosen = native.given(scenario) if scenario.net.endswith(SUFFIX) else None
+    chosen = traffic.given(scenario) if scenario.net.endswith(SUFFIX) else None
     net = network.load(scenario.net) if chosen is None else controllable(chosen)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
@@ -58,7 +58,7 @@ def run(
     if chosen is not None and chosen.end_s is not None:
         duration_s = chosen.end_s - chosen.begin_s
     steps = int(np.ceil(duration_s / step_s))
-    routes = chosen or _routes(scenario, net)
+    routes = chosen or traffic.drawn(scenario, net)
     folder = recording.new_folder(folder, _default_name(scenario))
     if isinstance(routes, Path):
         routes = Path(shutil.copyfile(routes, folder / "routes.rou.xml"))
@@ -150,20 +150,6 @@ def controllable(chosen: Case) -> Network:
     net = network.load(name, None, additional)
     refused = signals.refused(net)
     return network.load(name, refused, additional) if refused else net
-
-
-def _routes(scenario: Scenario, net: Network) -> Path:
-    """The scenario's demand, drawn."""
-    return demand.route_file(
-        net,
-        profile=scenario.profile,
-        duration_s=scenario.duration_s,
-        step_s=net.control_step_s,
-        scale=scenario.demand,
-        noise=scenario.noise,
-        seed=scenario.seed,
-        disturbance_veh_h=scenario.disturbance,
-    )
 
 
 def _predictor(net: Network, scenario: Scenario, routes: Path | Case, steps: int) -> Predictor:

@@ -203,7 +203,11 @@ def inspect(net: str, out: Path | None, as_json: bool) -> None:
     """Show what the bench makes of NET: links, stages, storage, what is controlled and what is left alone."""
     from utn_sumo import case, inspection, network, plots, recording, report  # noqa: PLC0415 - heavy
 
-    found = network.load(str(case.read(Path(net)).net_file) if net.endswith(case.SUFFIX) else net)
+    if net.endswith(case.SUFFIX):
+        chosen = case.read(Path(net))
+        found = network.load(str(chosen.net_file), additional=chosen.additional_files)
+    else:
+        found = network.load(net)
     result = inspection.inspect(found)
     folder = recording.new_folder(out, f"inspect-{found.name}")
     recording.write_json(folder / "inspection.json", result)

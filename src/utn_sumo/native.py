@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from utn_sumo import case, demand, metrics, network, recording
-from utn_sumo.case import Case
-from utn_sumo.errors import SettingError
+from utn_sumo import metrics, network, recording, traffic
+from utn_sumo.case import SUFFIX, Case
 from utn_sumo.plant import untouched
 from utn_sumo.plant.sumo import records, write_outputs
 from utn_sumo.plant.untouched import Look
@@ -82,35 +80,11 @@ def run(
 
 
 def of(scenario: Scenario) -> Case:
-    """The scenario's net and demand: of a .sumocfg its own, else a net with demand drawn as for every controller."""
-    if scenario.net.endswith(case.SUFFIX):
-        return given(scenario)
+    """The scenario's net and traffic: of a .sumocfg its own, else a net with demand drawn as for every controller."""
+    if scenario.net.endswith(SUFFIX):
+        return traffic.given(scenario)
     net = network.load(scenario.net)
-    routes = demand.route_file(
-        net,
-        profile=scenario.profile,
-        duration_s=scenario.duration_s,
-        step_s=net.control_step_s,
-        scale=scenario.demand,
-        noise=scenario.noise,
-        seed=scenario.seed,
-        disturbance_veh_h=scenario.disturbance,
-    )
     options = (("time-to-teleport", "-1"), ("max-depart-delay", "-1"))
-    return Case(net.net_file, net.net_file, (routes,), (), 0.0, scenario.duration_s, -1.0, options)
-
-
-def given(scenario: Scenario) -> Case:
-    """The case of a .sumocfg; `demand` scales all of its traffic, `hours` is the most of its window that is run."""
-    for name in ("profile", "noise", "disturbance"):
-        if name in scenario.model_fields_set:
-            value = getattr(scenario, name)
-            raise SettingError(f"setting {name!r} is {value!r}: {scenario.net!r} has a demand of its own, leave it out")
-    found = case.read(Path(scenario.net))
-    end_s = found.end_s
-    if "hours" in scenario.model_fields_set:
-        end_s = (
-            found.begin_s + scenario.duration_s if end_s is None else min(end_s, found.begin_s + scenario.duration_s)
-        )
-    options = found.options if scenario.demand == 1 else (*found.options, ("scale", f"{scenario.demand:g}"))
-    return replace(found, end_s=end_s, options=options)
+    return Case(
+        net.net_file, net.net_file, (traffic.drawn(scenario, net),), (), 0.0, scenario.duration_s, -1.0, options
+    )

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from utn_sumo.errors import PlantError
+from utn_sumo.plant.sumo import SumoPlant, first_line
 
 LOOK_S = 10.0
 """Time between two looks at how full the roads are."""
@@ -42,8 +43,6 @@ def run(arguments: Sequence[str], begin_s: float, end_s: float | None, on_look: 
     Raises PlantError if SUMO does not start or breaks off. A KeyboardInterrupt ends the run early.
     """
     import libsumo  # noqa: PLC0415 - heavy
-
-    from utn_sumo.plant.sumo import SumoPlant, first_line  # noqa: PLC0415
 
     if SumoPlant.is_open():
         raise PlantError("SUMO already runs in this process: close that plant first, or use another process")
