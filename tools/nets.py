@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from utn_sumo import network, sumo_tools
-from utn_sumo.contract import EXIT, Junction, Link, Network, Stage, Turn
+from utn_sumo.contract import EXIT, Junction, LaneGroup, Link, Network, Stage, Turn
 
 CYCLE_S, MIN_GREEN_S, YELLOW_S, ALL_RED_S = 120.0, 10.0, 3.0, 2.0
 FREE_SPEED_M_S, SPACING_M, LANE_VEH_S = 40 / 3.6, 7.5, 0.5
@@ -43,6 +43,7 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
                 queue_spacing_m=SPACING_M / lanes,
                 saturation_flow_veh_s=LANE_VEH_S * lanes,
                 is_source=source,
+                turning_worth_veh=200.0,
             )
         )
 
@@ -54,6 +55,7 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
                 add("s", row, column, source=True)
 
     turns: list[Turn] = []
+    groups = [LaneGroup(index, tuple(range(link.lanes))) for index, link in enumerate(links)]
     stages: list[Stage] = []
     junctions: list[Junction] = []
     for row in range(rows):
@@ -69,10 +71,10 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
                 for next_link, share in ((along, share_along), (across, 1 - share_along)):
                     served.append(len(turns))
                     to_edge = links[next_link].id if next_link != EXIT else f"exit{row}.{column}"
-                    turns.append(Turn(link, to_edge, next_link, share, ()))
+                    turns.append(Turn(link, to_edge, next_link, share, (), link))
                 letters = "".join("G" if other == position else "r" for other in range(len(here)) for _ in range(2))
                 clearance = ((letters.replace("G", "y"), YELLOW_S), ("r" * len(letters), ALL_RED_S))
-                stages.append(Stage(row * columns + column, letters, clearance, tuple(served)))
+                stages.append(Stage(row * columns + column, letters, clearance, tuple(served), MIN_GREEN_S))
             count = len(turns) - first_turn
             junctions.append(
                 Junction(
@@ -80,7 +82,6 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
                     stages=tuple(range(first_stage, len(stages))),
                     cycle_s=CYCLE_S,
                     offset_s=0.0,
-                    min_green_s=MIN_GREEN_S,
                     signal_turn=tuple(range(first_turn, len(turns))),
                     conflicts=tuple(tuple(a // 2 != b // 2 for b in range(count)) for a in range(count)),
                 )
@@ -90,9 +91,10 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
         net_file=Path(),
         links=tuple(links),
         turns=tuple(turns),
+        groups=tuple(groups),
         stages=tuple(stages),
         junctions=tuple(junctions),
-        edge_lanes={link.id: link.lanes for link in links},
+        edge_lanes={link.id: tuple(range(link.lanes)) for link in links},
         edge_length_m={link.id: link.length_m for link in links},
         startup_lag_s=2.0,
     )

@@ -15,7 +15,19 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import utn_sumo
-from utn_sumo import calibration, controllers, demand, metrics, monitor, native, network, recording, signals, traffic
+from utn_sumo import (
+    calibration,
+    controllers,
+    demand,
+    metrics,
+    monitor,
+    native,
+    network,
+    recording,
+    routes,
+    signals,
+    traffic,
+)
 from utn_sumo.case import SUFFIX, Case
 from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
@@ -58,12 +70,12 @@ def run(
     if chosen is not None and chosen.end_s is not None:
         duration_s = chosen.end_s - chosen.begin_s
     steps = int(np.ceil(duration_s / step_s))
-    routes = chosen or traffic.drawn(scenario, net)
+    driving = chosen or traffic.drawn(scenario, net)
     folder = recording.new_folder(folder, _default_name(scenario))
-    if isinstance(routes, Path):
-        routes = Path(shutil.copyfile(routes, folder / "routes.rou.xml"))
+    if isinstance(driving, Path):
+        driving = Path(shutil.copyfile(driving, folder / "routes.rou.xml"))
         shutil.copyfile(net.net_file, folder / "net.net.xml")
-    predictor = _predictor(net, scenario, routes, steps)
+    predictor = _predictor(net, scenario, driving, steps)
     # Of other people's vehicles some start amid links, and nobody says how many.
     disturbance_veh = scenario.disturbance * scenario.demand * step_s / 3600 if chosen is None else UNKNOWN_VEH
     estimator = Estimator(net, known, scenario.loop_error, disturbance_veh)
@@ -76,7 +88,7 @@ def run(
     with (
         threadpool_limits(1),
         predictor,
-        SumoPlant(net, routes, folder, seed=scenario.seed, duration_s=duration_s) as plant,
+        SumoPlant(net, driving, folder, seed=scenario.seed, duration_s=duration_s) as plant,
     ):
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
@@ -146,19 +158,19 @@ def _progress(time_s: float, duration_s: float, seen: Look) -> Progress:
 
 def controllable(chosen: Case) -> Network:
     """A net as other people have it, with the signals left alone whose own stages can't be shown safely."""
-    name, additional = str(chosen.net_file), chosen.additional_files
-    net = network.load(name, None, additional)
+    name, additional, coming = str(chosen.net_file), chosen.additional_files, routes.read(chosen)
+    net = network.load(name, None, additional, coming)
     refused = signals.refused(net)
-    return network.load(name, refused, additional) if refused else net
+    return network.load(name, refused, additional, coming) if refused else net
 
 
-def _predictor(net: Network, scenario: Scenario, routes: Path | Case, steps: int) -> Predictor:
+def _predictor(net: Network, scenario: Scenario, driving: Path | Case, steps: int) -> Predictor:
     """What foretells demand and disturbances. Of other people's demand there is no profile, and no look ahead."""
     profile_veh = coming_veh = None
-    if isinstance(routes, Path):
+    if isinstance(driving, Path):
         profile_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
         profile_veh = profile_veh_h * net.control_step_s / 3600
-        coming_veh = demand.coming_veh(net, routes, steps) if scenario.forecast == "perfect" else None
+        coming_veh = demand.coming_veh(net, driving, steps) if scenario.forecast == "perfect" else None
     return Predictor(
         net,
         scenario.forecast,

@@ -19,7 +19,7 @@ from utn_sumo.contract import Floats, Network
 from utn_sumo.errors import NetworkError
 from utn_sumo.model import LinkModel
 from utn_sumo.recording import Log
-from utn_sumo.rollout import known_demand_veh, known_source_queue_veh, predict, starts
+from utn_sumo.rollout import Outside, predict, starts
 
 STEP_S = 10.0
 """The paper's sampling interval."""
@@ -50,12 +50,12 @@ def calibrate(network: Network, log: Log, step_s: float = STEP_S) -> dict[str, A
     size = len(FITTED) * len(network.links)
     start = np.append(np.ones(size), network.startup_lag_s)
     spread = np.array(list(FITTED.values()))[:, None]
-    demand, waiting, first = known_demand_veh(network, log), known_source_queue_veh(log), starts(log, HORIZON)
+    outside, first = Outside.known(network, log), starts(log, HORIZON)
 
     def residual(parameters: Floats) -> Floats:
         model = LinkModel(_scaled(with_turns, parameters), step_s)
         turning = np.array([log.fraction[first]] * HORIZON)
-        prediction = predict(model, log, HORIZON, demand_veh=demand, source_queue_veh=waiting, fraction=turning)
+        prediction = predict(model, log, HORIZON, outside=outside, fraction=turning)
         error = np.array([prediction.x_veh[ahead] - log.true_x_veh[first + ahead] for ahead in FITTED_AHEAD])
         factors = parameters[:-1].reshape(len(FITTED), -1)
         common = factors.mean(axis=1, keepdims=True)

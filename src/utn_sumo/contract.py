@@ -22,8 +22,8 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 EXIT = -1
-MOST_STEP_S = 360.0
-"""Longest time between two decisions that junctions with different cycles make necessary."""
+MOST_CYCLES = 3
+"""Longest cycles between two decisions that junctions with different cycles make necessary."""
 SAMPLE_S = 10.0
 """Longest time between two readings of the entry loops (the paper's sampling interval)."""
 
@@ -46,6 +46,21 @@ class Link:
     """Of all its lanes together (mu_z)."""
     is_source: bool
     """Whether traffic from outside enters here."""
+    turning_worth_veh: float
+    """Vehicles that its known turning fractions are worth against what is seen turning."""
+    joining: tuple[str, ...] = ()
+    """SUMO lanes, inside nodes without signals, over which traffic comes onto the link amid it."""
+    parting: tuple[str, ...] = ()
+    """Those over which it leaves amid it."""
+
+
+@dataclass(frozen=True)
+class LaneGroup:
+    """Lanes before a stop line that the same turns share: one queue (a turn's pocket is another than the others')."""
+
+    link: int
+    lanes: tuple[int, ...]
+    """Numbers of the lanes of the link's last edge."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +75,8 @@ class Turn:
     """beta_{z,d}: share of the link's traffic that takes this turn."""
     via_lanes: tuple[str, ...]
     """SUMO lanes inside the junction that carry this turn and no other."""
+    group: int
+    """Lane group that its traffic queues in."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +90,9 @@ class Stage:
     """(letters, seconds) shown in turn after it: yellow, all-red."""
     turns: tuple[int, ...]
     """Turns that it serves."""
+    min_green_s: float
+    held: tuple[tuple[int, ...], ...] = ()
+    """Turns that are green in each part of the clearance: still from this stage, or already for the next."""
 
     @property
     def clearance_s(self) -> float:
@@ -87,11 +107,23 @@ class Junction:
     stages: tuple[int, ...]
     cycle_s: float
     offset_s: float
-    min_green_s: float
     signal_turn: tuple[int, ...]
     """Turn of each signal letter, -1 where the letter serves none that we model."""
     conflicts: tuple[tuple[bool, ...], ...]
-    """conflicts[a][b]: the streams of letters a and b cross."""
+    """conflicts[a][b]: the streams of letters a and b cross, or come from two roads into one lane."""
+    without_yellow: tuple[int, ...] = ()
+    """Letters that need none: pedestrian crossings', and those of no stream."""
+
+
+@dataclass(frozen=True)
+class HeldGreen:
+    """A part of a clearance in which some turns are green."""
+
+    stage: int
+    after_s: float
+    """From the stage's end to its begin."""
+    duration_s: float
+    turns: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -102,10 +134,12 @@ class Network:
     net_file: Path
     links: tuple[Link, ...]
     turns: tuple[Turn, ...]
+    groups: tuple[LaneGroup, ...]
+    """In the order of their links."""
     stages: tuple[Stage, ...]
     junctions: tuple[Junction, ...]
-    edge_lanes: Mapping[str, int]
-    """Lanes of every SUMO edge that a link or a turn names."""
+    edge_lanes: Mapping[str, tuple[int, ...]]
+    """Numbers of the lanes for motor vehicles of every SUMO edge that a link or a turn names."""
     edge_length_m: Mapping[str, float]
     startup_lag_s: float
     """Time from the start of green until the queue moves over the stop line; the yellow gives it back at its end."""
@@ -138,13 +172,45 @@ class Network:
         return matrix
 
     @cached_property
-    def turn_stages(self) -> tuple[Ints, Ints, Ints]:
-        """Stages of each turn in turn, one after the other; where each turn's begin; the turns that have any."""
-        turn, stage = np.array(
-            sorted((turn, index) for index, item in enumerate(self.stages) for turn in item.turns), dtype=np.int64
-        ).T
+    def turn_group(self) -> Ints:
+        """(M,) lane group of each turn."""
+        return np.array([turn.group for turn in self.turns], dtype=np.int64)
+
+    @cached_property
+    def group_link(self) -> Ints:
+        """(G,) link of each lane group."""
+        return np.array([group.link for group in self.groups], dtype=np.int64)
+
+    @cached_property
+    def unsignalled(self) -> Bools:
+        """(M,) turns that no signal stops."""
+        free = np.ones(len(self.turns), dtype=np.bool_)
+        for junction in self.junctions:
+            free[[turn for turn in junction.signal_turn if turn >= 0]] = False
+        return free
+
+    @cached_property
+    def held_greens(self) -> tuple[HeldGreen, ...]:
+        """The parts of clearances in which some turn is green, in the order of the stages."""
+        found = []
+        for index, stage in enumerate(self.stages):
+            after_s = 0.0
+            for (_, seconds), turns in zip(stage.clearance, stage.held, strict=False):
+                if turns:
+                    found.append(HeldGreen(index, after_s, seconds, turns))
+                after_s += seconds
+        return tuple(found)
+
+    @cached_property
+    def turn_windows(self) -> tuple[Ints, Ints, Ints]:
+        """Windows of green of each turn in turn: stages, then held greens, numbered on; where each turn's begin; the
+        turns that have any.
+        """
+        served = [stage.turns for stage in self.stages] + [held.turns for held in self.held_greens]
+        pairs = sorted((turn, index) for index, turns in enumerate(served) for turn in turns)
+        turn, window = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
         turns, starts = np.unique(turn, return_index=True)
-        return stage, starts, turns
+        return window, starts, turns
 
     @cached_property
     def links_of(self) -> tuple[Ints, ...]:
@@ -155,6 +221,11 @@ class Network:
     def turns_of(self) -> tuple[Ints, ...]:
         """(J,) turns of each junction's links."""
         return _places(self.link_junction[self.turn_link], len(self.junctions))
+
+    @cached_property
+    def groups_of(self) -> tuple[Ints, ...]:
+        """(J,) lane groups of each junction's links."""
+        return _places(self.link_junction[self.group_link], len(self.junctions))
 
     @cached_property
     def link_junction(self) -> Ints:
@@ -177,9 +248,24 @@ class Network:
         return np.array([link.saturation_flow_veh_s for link in self.links])
 
     @cached_property
+    def group_saturation_flow_veh_s(self) -> Floats:
+        """(G,) saturation flow of each lane group: its share of the link's lanes."""
+        lanes = np.array([len(group.lanes) for group in self.groups])
+        return np.asarray(self.saturation_flow_veh_s[self.group_link] * lanes / self._lanes[self.group_link])
+
+    @cached_property
+    def _lanes(self) -> Ints:
+        return np.array([link.lanes for link in self.links], dtype=np.int64)
+
+    @cached_property
     def is_source(self) -> Bools:
         """(Z,) whether traffic from outside enters the link."""
         return np.array([link.is_source for link in self.links], dtype=np.bool_)
+
+    @cached_property
+    def turning_worth_veh(self) -> Floats:
+        """(Z,) vehicles that the known turning fractions of each link are worth."""
+        return np.array([link.turning_worth_veh for link in self.links])
 
     @cached_property
     def free_time_s(self) -> Floats:
@@ -225,7 +311,7 @@ class Network:
     @cached_property
     def min_green_s(self) -> Floats:
         """(S,) shortest green of each stage."""
-        return np.array([self.junctions[stage.junction].min_green_s for stage in self.stages])
+        return np.array([stage.min_green_s for stage in self.stages])
 
     @cached_property
     def cycle_s(self) -> Floats:
@@ -248,11 +334,11 @@ class Network:
     def control_step_s(self) -> float:
         """Time between two decisions: the least common multiple of the cycles (SPEC 2.7, N = 1).
 
-        Where that is beyond `MOST_STEP_S` it is the longest cycle: plans are then handed over where each junction's
-        cycle begins, wherever in the step that is.
+        Where that is more than `MOST_CYCLES` times the longest cycle it is the longest cycle: plans are then handed
+        over where each junction's cycle begins, wherever in the step that is.
         """
-        multiple = float(np.lcm.reduce(self.cycle_s.astype(np.int64)))
-        return self.whole_step_s or (multiple if multiple <= MOST_STEP_S else float(self.cycle_s.max()))
+        multiple, longest_s = float(np.lcm.reduce(self.cycle_s.astype(np.int64))), float(self.cycle_s.max())
+        return self.whole_step_s or (multiple if multiple <= MOST_CYCLES * longest_s else longest_s)
 
     @property
     def samples(self) -> int:
@@ -270,10 +356,12 @@ class Network:
         Indices count within the part; a turn that leads to another junction ends in EXIT.
         """
         links = np.concatenate([self.links_of[junction] for junction in junctions]).tolist()
+        groups = np.concatenate([self.groups_of[junction] for junction in junctions]).tolist()
         turns = np.concatenate([self.turns_of[junction] for junction in junctions]).tolist()
         stages = [stage for junction in junctions for stage in self.junctions[junction].stages]
-        link_place, turn_place, stage_place, junction_place = (
-            {whole: position for position, whole in enumerate(each)} for each in (links, turns, stages, junctions)
+        link_place, turn_place, group_place, stage_place, junction_place = (
+            {whole: position for position, whole in enumerate(each)}
+            for each in (links, turns, groups, stages, junctions)
         )
 
         def ahead(turn: Turn) -> int:
@@ -287,14 +375,18 @@ class Network:
                 replace(self.links[link], junction=junction_place[self.links[link].junction]) for link in links
             ),
             turns=tuple(
-                replace(turn, link=link_place[turn.link], next_link=ahead(turn))
+                replace(turn, link=link_place[turn.link], next_link=ahead(turn), group=group_place[turn.group])
                 for turn in (self.turns[index] for index in turns)
+            ),
+            groups=tuple(
+                replace(group, link=link_place[group.link]) for group in (self.groups[index] for index in groups)
             ),
             stages=tuple(
                 replace(
                     stage,
                     junction=junction_place[stage.junction],
                     turns=tuple(turn_place[turn] for turn in stage.turns),
+                    held=tuple(tuple(turn_place[turn] for turn in turns) for turns in stage.held),
                 )
                 for stage in (self.stages[index] for index in stages)
             ),
@@ -317,12 +409,18 @@ class Network:
         return next(index for index, link in enumerate(self.links) if link.id == link_id)
 
     def equal_split(self) -> Plan:
-        """The backup plan: each junction's green shared equally among its stages, in whole seconds."""
+        """The backup plan: each junction's green shared equally among its stages, in whole seconds.
+
+        A stage whose least is more than that has its least, and the others share the rest.
+        """
         green = np.zeros(len(self.stages))
         for junction, budget in zip(self.junctions, self.green_budget_s, strict=True):
-            share, rest = divmod(round(budget), len(junction.stages))
-            for position, stage in enumerate(junction.stages):
-                green[stage] = share + (position < rest)
+            by_least = sorted(junction.stages, key=lambda stage: -self.stages[stage].min_green_s)
+            rest_s = round(budget)
+            for position, stage in enumerate(by_least):
+                equal_s = -(-rest_s // (len(by_least) - position))
+                green[stage] = max(self.stages[stage].min_green_s, equal_s)
+                rest_s -= int(green[stage])
         return Plan(green_s=green)
 
 
@@ -344,6 +442,10 @@ class Measurement:
     """(M,) over the loops just behind the stop line, where the turns part."""
     queue_veh: Floats
     """(Z,) standing in the lane-area detectors at the end."""
+    group_queue_veh: Floats
+    """(G,) of these, who stands on the lanes of each lane group."""
+    beside_veh: Floats
+    """(Z,) counted onto the link amid it over the loops at side roads, less those counted off it."""
     seen_veh: Floats
     """(Z,) in the lane-area detectors at the end, moving or not."""
     entry_occupancy: Floats

@@ -1,10 +1,11 @@
 """Loops and lane-area detectors of a network, as a SUMO additional file.
 
-Every lane of a link has a loop at its entry, one at its stop line, and a lane-area detector on the last 200 m
-before it. What leaves is counted by loops just behind the stop line, on the lanes on which the turns part: a loop
-before the line misses a vehicle that changes lanes in the very step in which it crosses (38 of 42,900 in 4 h of
-`utn17`), and could not tell turns apart. All report once a control step, which is when they are read: interval
-counts, never sums of steps (SPEC 6).
+Every lane for motor vehicles of a link has a loop at its entry, one at its stop line, and a lane-area detector on the
+last 200 m before it; where side roads meet the link amid it, loops count who comes and who goes. What leaves is
+counted by loops just behind the stop line, on the lanes on which the turns part: a loop before the line misses a
+vehicle that changes lanes in the very step in which it crosses (38 of 42,900 in 4 h of `utn17`), and could not tell
+turns apart. All report once a control step, which is when they are read: interval counts, never sums of steps (SPEC
+6).
 """
 
 from __future__ import annotations
@@ -37,13 +38,17 @@ class DetectorIds:
     stop_line: tuple[tuple[str, ...], ...]
     turn: tuple[tuple[str, ...], ...]
     area: tuple[tuple[str, ...], ...]
+    group: tuple[tuple[str, ...], ...]
+    """(G,) of the lane-area detectors those on a lane group."""
+    joining: tuple[tuple[str, ...], ...]
+    parting: tuple[tuple[str, ...], ...]
 
 
 def ids(network: Network) -> DetectorIds:
     """The ids under which `write` puts the detectors of `network` into a file."""
 
     def on(kind: str, edge: str) -> tuple[str, ...]:
-        return tuple(f"{kind}_{edge}_{lane}" for lane in range(network.edge_lanes[edge]))
+        return tuple(f"{kind}_{edge}_{lane}" for lane in network.edge_lanes[edge])
 
     return DetectorIds(
         entry=tuple(on("entry", link.edges[0]) for link in network.links),
@@ -52,6 +57,12 @@ def ids(network: Network) -> DetectorIds:
         area=tuple(
             tuple(name for edge, _ in _watched(network, link) for name in on("area", edge)) for link in network.links
         ),
+        group=tuple(
+            tuple(f"area_{network.links[group.link].edges[-1]}_{lane}" for lane in group.lanes)
+            for group in network.groups
+        ),
+        joining=tuple(tuple(f"side_{lane}" for lane in link.joining) for link in network.links),
+        parting=tuple(tuple(f"side_{lane}" for lane in link.parting) for link in network.links),
     )
 
 
@@ -77,11 +88,11 @@ def write(network: Network, path: Path, period_s: float) -> None:
 
     for link in network.links:
         for kind, edge, position_m in (("entry", link.edges[0], ENTRY_M), ("stop", link.edges[-1], STOP_LINE_M)):
-            for lane in range(network.edge_lanes[edge]):
+            for lane in network.edge_lanes[edge]:
                 loop(f"{kind}_{edge}_{lane}", f"{edge}_{lane}", position_m)
         for watched, seen_m in _watched(network, link):
             length_m = network.edge_length_m[watched]
-            for lane in range(network.edge_lanes[watched]):
+            for lane in network.edge_lanes[watched]:
                 place = {
                     "id": f"area_{watched}_{lane}",
                     "lane": f"{watched}_{lane}",
@@ -92,6 +103,9 @@ def write(network: Network, path: Path, period_s: float) -> None:
     for turn in network.turns:
         for via in turn.via_lanes:
             loop(f"turn_{via}", via, TURN_M)
+    # One link's traffic may part onto another's: one loop then counts for both.
+    for via in sorted({via for link in network.links for via in (*link.joining, *link.parting)}):
+        loop(f"side_{via}", via, TURN_M)
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
 

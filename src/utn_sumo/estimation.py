@@ -1,11 +1,12 @@
 """Detector counts to the state vector: vehicles, queues, source queues and turning, all in veh.
 
-x is counted in at the entry loops and out at the turn loops, so that it is conserved from link to link. Loops miscount,
+x is counted in at the entry loops, in and out at side roads, and out at the turn loops, so that it is conserved from
+link to link. Loops miscount,
 and a count that is summed up never forgets; so a Kalman filter by link holds the count against what can be seen: where
 no queue stands, the vehicles in view of the lane-area detectors and those that entered too short ago to be in view are
 all there are. Its second state is by how much the link's loops differ, which is what makes a count drift; its third how
-many come onto the link amid it in a step, which no loop counts (e_z of SPEC 2.1).
-q comes from the lane-area detectors, and its split by turn from who came and who went.
+many come onto the link amid it in a step that no loop counts (e_z of SPEC 2.1).
+q comes from the lane-area detectors by lane group, and its split by turn within one from who came and who went.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ SHUT_SD = 2.0
 """So many standard deviations too few entering a link that is not free: those who came have to wait."""
 TURN_MEMORY_STEPS = 30.0
 """Control steps after which what was seen turning weighs 1/e."""
-TURN_PRIOR_VEH = 200.0
-"""Vehicles that the known turning fractions are worth."""
+NEVER = 1e-9
+"""Share of a turn that nobody takes: queues are split by shares, and these must not vanish."""
 
 
 class Estimator:
@@ -71,17 +72,19 @@ class Estimator:
         self._q_veh = np.zeros(turns)
         self._source_queue_veh = np.zeros(links)
         self._past_inflow_veh = np.zeros((known.delay_samples, links))
-        self._turning_veh = TURN_PRIOR_VEH * known.fraction
+        self._known_turning_veh = known.turning_worth_veh[known.turn_link] * known.fraction
+        self._turning_veh = self._known_turning_veh
         length_m = np.array([link.length_m for link in network.links])
         speed_m_s = np.array([link.free_speed_m_s for link in known.links])
         self._watched_veh = network.storage_veh * np.minimum(1, AREA_REACH_M / length_m)
         hidden_s = np.maximum(length_m - AREA_REACH_M, 0) / speed_m_s
         self._hidden = share_on_the_way(hidden_s, network.sample_s, known.delay_samples)
         """(H, Z) share of each past sample's inflow that has not come into view, on a free road."""
-        same_link = network.turn_link[:, None] == network.turn_link
-        same_green = (network.serves[:, :, None] == network.serves[:, None, :]).all(axis=0)
-        self._together = (same_link & same_green).astype(float)
-        """(M, M) 1 where two turns of a link always have green together: sums by such group."""
+        # Turns of a lane group that always have green together: one number each.
+        greens = [(group, *row) for group, row in zip(network.turn_group, _windows_of(network), strict=True)]
+        number = {green: place for place, green in enumerate(dict.fromkeys(greens))}
+        self._together = np.array([number[green] for green in greens], dtype=np.int64)
+        """(M,) which turns of a lane group always have green together: these have the same number."""
         self._free_cover_s = np.full(links, np.nan)
         """(Z,) time that a vehicle covers the loops at a source's entry when nothing holds it up."""
         self._cycle = 0
@@ -105,11 +108,12 @@ class Estimator:
     def _count(self, seen: Measurement, entered_veh: Floats) -> None:
         """X by the Kalman filter: counted on, and held against what is seen where the road is free."""
         left = self._by_link(seen.turned_veh)
+        entered_veh = entered_veh + seen.beside_veh
         x = self._x_veh + entered_veh - (1 - self._bias) * left + self._usual_veh
         move = np.tile(np.eye(3), (len(x), 1, 1))
         move[:, 0, 1], move[:, 0, 2] = left, 1.0
         covariance = move @ self._covariance @ move.transpose(0, 2, 1)
-        covariance[:, 0, 0] += self._count_variance * (entered_veh + left) + self._disturbance_variance
+        covariance[:, 0, 0] += self._count_variance * (np.abs(entered_veh) + left) + self._disturbance_variance
         covariance[:, 1, 1] += self._bias_step_variance
         covariance[:, 2, 2] += self._disturbance_step_variance
 
@@ -126,28 +130,46 @@ class Estimator:
         unwatched_veh = self.network.storage_veh - self._watched_veh
         before = self._x_veh
         self._x_veh = np.clip(x + gain[:, 0] * residual, seen.seen_veh, seen.seen_veh + unwatched_veh)
+        self._disturbance_veh = seen.beside_veh.copy()
         if self._disturbance_variance > 0:
-            self._disturbance_veh = self._x_veh - before - entered_veh + (1 - self._bias) * left
+            self._disturbance_veh += self._x_veh - before - entered_veh + (1 - self._bias) * left
 
     def _queue(self, seen: Measurement) -> None:
         """q: standing in view, and all beyond the view where the view stands full.
 
-        By turn: what has green at the same times leaves in the order in which it came, so who is left has turns like
-        any other arrivals, whatever the last ones happened to choose; between signals with other times, who came
-        and who went is kept count of.
+        By lane group: who stands on its lanes, and of those who stand before the lanes part its share. By turn: what
+        has green at the same times leaves in the order in which it came, so who is left has turns like any other
+        arrivals, whatever the last ones happened to choose; between signals with other times, who came and who went
+        is kept count of.
         """
         beyond = np.where(seen.queue_veh >= FULL_SHARE * self._watched_veh, self._x_veh - seen.seen_veh, 0.0)
         queue = np.minimum(seen.queue_veh + beyond, self._x_veh)
-        fraction, link = self._fraction(), self.network.turn_link
+        fraction, link = self._fraction() + NEVER, self.network.turn_link
         arrived = np.maximum(queue - self._by_link(self._q_veh) + self._by_link(seen.turned_veh), 0.0)
-        split = self._together @ (self._q_veh + fraction * arrived[link] - seen.turned_veh)
-        split = np.maximum(split, 0.0) * fraction / (self._together @ fraction)
-        total = self._by_link(split)[link]
-        self._q_veh = np.where(total > 0, split / np.maximum(total, 1e-9), fraction) * queue[link]
+        together = self._together
+        balance = np.bincount(together, self._q_veh + fraction * arrived[link] - seen.turned_veh)[together]
+        split: Floats = np.maximum(balance, 0.0) * fraction / np.bincount(together, fraction)[together]
+        self._q_veh = self._group_queue(seen, queue)[self.network.turn_group] * self._share_of_group(split, fraction)
+
+    def _group_queue(self, seen: Measurement, queue_veh: Floats) -> Floats:
+        """(G,) the links' queues by lane group."""
+        network = self.network
+        groups, link = len(network.groups), network.group_link
+        standing = seen.group_queue_veh
+        before_parting = np.maximum(queue_veh - np.bincount(link, standing, len(queue_veh)), 0.0)
+        queue: Floats = standing + before_parting[link] * np.bincount(network.turn_group, self._fraction(), groups)
+        total = np.bincount(link, queue, len(queue_veh))
+        return np.asarray(queue * np.minimum(1.0, queue_veh / np.maximum(total, 1e-9))[link])
+
+    def _share_of_group(self, split_veh: Floats, fraction: Floats) -> Floats:
+        """(M,) each turn's share of its lane group's queue: as `split_veh`, or where that is nobody as the traffic."""
+        group = self.network.turn_group
+        counted, usual = (np.bincount(group, each)[group] for each in (split_veh, fraction))
+        return np.asarray(np.where(counted > 0, split_veh / np.maximum(counted, 1e-9), fraction / usual))
 
     def _turn(self, turned_veh: Floats) -> None:
         """Turning fractions: what was known, worth so many vehicles, and what was seen, slowly forgotten."""
-        prior = TURN_PRIOR_VEH * self.known.fraction
+        prior = self._known_turning_veh
         self._turning_veh = prior + (self._turning_veh - prior) * np.exp(-1 / TURN_MEMORY_STEPS) + turned_veh
 
     def _fraction(self) -> Floats:
@@ -156,7 +178,7 @@ class Estimator:
     def _wait_outside(self, seen: Measurement, entered_veh: Floats, expected_veh: Floats) -> None:
         """Who was expected at a source and did not enter waits, if the entry loops show that the way in was blocked."""
         network = self.network
-        lanes = np.array([network.edge_lanes[link.edges[0]] for link in network.links])
+        lanes = np.array([len(network.edge_lanes[link.edges[0]]) for link in network.links])
         covered_s = seen.entry_occupancy * lanes * network.control_step_s
         cover_s = covered_s / np.maximum(entered_veh, 1.0)
         free = self._x_veh <= FREE_SHARE * network.storage_veh
@@ -187,3 +209,12 @@ class Estimator:
             fraction=self._fraction(),
             disturbance_veh=self._disturbance_veh.copy(),
         )
+
+
+def _windows_of(network: Network) -> list[tuple[int, ...]]:
+    """Of each turn the windows in which it has green (`Network.turn_windows`)."""
+    window, starts, turns = network.turn_windows
+    found: list[tuple[int, ...]] = [()] * len(network.turns)
+    for turn, own in zip(turns.tolist(), np.split(window, starts[1:]), strict=True):
+        found[turn] = tuple(own.tolist())
+    return found

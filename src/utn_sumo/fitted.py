@@ -37,11 +37,11 @@ def fit_s(network: Network, green_s: Floats) -> Floats:
     fitted = np.zeros(len(green_s))
     for junction, budget_s in zip(network.junctions, network.green_budget_s, strict=True):
         stages = list(junction.stages)
-        wish, least = np.maximum(green_s[stages], 0.0) + NOTHING_S, junction.min_green_s
+        wish, least = np.maximum(green_s[stages], 0.0) + NOTHING_S, network.min_green_s[stages]
         short = np.zeros(len(stages), dtype=np.bool_)
         # Who comes out under the least gets the least, and the others share what that leaves.
         for _ in stages:
-            rest_s = budget_s - least * short.sum()
+            rest_s = budget_s - least[short].sum()
             fitted[stages] = np.where(short, least, wish * rest_s / max(wish[~short].sum(), NOTHING_S))
             short |= fitted[stages] < least
     return fitted

@@ -29,7 +29,7 @@ def _junction(network: Network, index: int, refused: Mapping[str, str]) -> dict[
         "offset_s": junction.offset_s,
         "stages": len(junction.stages),
         "green_budget_s": float(part.green_budget_s[0]),
-        "min_green_s": junction.min_green_s,
+        "min_green_s": part.min_green_s.tolist(),
         "links": [link.id for link in part.links],
         "refused": refused.get(junction.id, ""),
     }

@@ -15,7 +15,7 @@ import numpy as np
 from utn_sumo.contract import Floats, Network
 from utn_sumo.model import LinkModel
 from utn_sumo.recording import Log
-from utn_sumo.rollout import known_demand_veh, known_fraction, known_source_queue_veh, predict, starts
+from utn_sumo.rollout import Outside, known_fraction, predict, starts
 
 
 @dataclass(frozen=True)
@@ -40,17 +40,16 @@ def errors(
 ) -> Errors:
     """Errors of the model with a step of `step_s`, over all the runs of one demand.
 
-    With `known_demand` the model is told who will want to enter and who waits outside; without, it has the forecast and
-    the estimate. With `known_turning` it is told how the traffic will turn in each step ahead.
+    With `known_demand` the model is told who will want to enter, who waits outside, and who comes or ends amid links;
+    without, it has the forecast and the estimate. With `known_turning` it is told how the traffic will turn in each
+    step ahead.
     """
     model = LinkModel(network, step_s)
-    demand, waiting = log.forecast_veh, log.source_queue_veh
-    if known_demand:
-        demand, waiting = known_demand_veh(network, log), known_source_queue_veh(log)
+    outside = Outside.known(network, log) if known_demand else Outside.foreseen(log)
     first = starts(log, horizon)
     at = first + np.arange(horizon)[:, None]
     fraction = known_fraction(network, log)[at] if known_turning else np.array([log.fraction[first]] * horizon)
-    prediction = predict(model, log, horizon, demand_veh=demand, source_queue_veh=waiting, fraction=fraction)
+    prediction = predict(model, log, horizon, outside=outside, fraction=fraction)
     true_x = log.true_x_veh[at]
     runs = true_x.shape[2]
     history = (log.true_x_veh.sum(axis=1, keepdims=True) - log.true_x_veh) / max(runs - 1, 1)

@@ -175,7 +175,7 @@ class LinkNumbers:
     """What the terms of SPEC 2.3 need to know of each link; CasADi symbols where many junctions share one problem."""
 
     saturation_veh_s: Any
-    """(M,) saturation flow of each turn's link."""
+    """(M,) saturation flow of each turn's lane group."""
     storage_veh: Any
     """(Z,)"""
     room_share: Any
@@ -184,6 +184,8 @@ class LinkNumbers:
 
 WAVE_SPEED_M_S = 6.0
 """Speed at which a queue's start-up travels upstream: a standing vehicle's 7.5 m in about 1.3 s."""
+NO_TRAFFIC = 1e-12
+"""Keeps the shares of a lane group finite where all of its turns are out of use."""
 STEP_TOLERANCE = 1e-9
 MOST_SWEEPS, RADIUS_POWER = 200, 64
 INFINITE_ROOM_VEH = 1e6
@@ -218,12 +220,15 @@ class LinkModel:
         served = np.concatenate([stage.turns for stage in network.stages]).astype(np.int64)
         self.served = _incidence(served, stages, (turns, len(network.stages)))
         """(M, S) 1 where a stage serves a turn."""
+        grouped = _incidence(network.turn_group, np.arange(turns), (len(network.groups), turns))
+        self._same_group = (grouped.T @ grouped).tocsr()
+        """(M, M) 1 where two turns are of one lane group."""
         self._is_exit = (~fed).astype(float)
         self._is_source = network.is_source.astype(float)
         # Room that opens at the stop line reaches the entry as a wave: within one step, only so much of it does.
         self._wave_s = np.array([link.length_m for link in network.links]) / WAVE_SPEED_M_S
         self.numbers = numbers or LinkNumbers(
-            network.saturation_flow_veh_s[network.turn_link],
+            network.group_saturation_flow_veh_s[network.turn_group],
             network.storage_veh,
             np.minimum(1.0, step_s / self._wave_s),
         )
@@ -300,8 +305,12 @@ class LinkModel:
         return moving_veh + inflow_veh - still
 
     def saturated_veh(self, green_s: Any, fraction: Any) -> Any:
-        """(M,) what green lets through: the second term of SPEC 2.3. `green_s` is by turn."""
-        return fraction * self.numbers.saturation_veh_s * green_s
+        """(M,) what green lets through: the second term of SPEC 2.3. `green_s` is by turn.
+
+        The turns of a lane group share its saturation flow as they share its traffic.
+        """
+        in_group = self.operations.matmul(self._same_group, fraction) + NO_TRAFFIC
+        return fraction / in_group * self.numbers.saturation_veh_s * green_s
 
     def room_veh(self, x_veh: Any) -> Any:
         """(Z,) vehicles that a link takes in a step: C - x, the third term of SPEC 2.3 before it is shared out."""
@@ -318,16 +327,24 @@ class LinkModel:
         return ops.share(left_s / ops.maximum(green_s, 1e-9))
 
     def step(
-        self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any, green_end_s: Any | None = None
+        self,
+        state: ModelState,
+        green_s: Any,
+        demand_veh: Any,
+        fraction: Any,
+        green_end_s: Any | None = None,
+        *,
+        held_s: Any = 0.0,
     ) -> tuple[ModelState, StepFlows]:
         """One step of the exact model.
 
-        `green_s` (S,) is the green of each stage within the step, `demand_veh` (Z,) what comes from outside,
-        `fraction` (M,) the turning fractions. `green_end_s` (M,) is when each turn's last green ends, counted from the
-        step's start: who reaches the queue after it waits for the next step. Without it the green may
-        stand anywhere. Vehicles are conserved, and 0 <= q <= x <= storage holds afterwards if it held before.
+        `green_s` (S,) is the green of each stage within the step, `held_s` (M,) what green each turn has beside that
+        of its stages, `demand_veh` (Z,) what comes from outside, `fraction` (M,) the turning fractions. `green_end_s`
+        (M,) is when each turn's last green ends, counted from the step's start: who reaches the queue after it waits
+        for the next step. Without it the green may stand anywhere. Vehicles are conserved, and 0 <= q <= x <= storage
+        holds afterwards if it held before.
         """
-        terms = self.terms(state, green_s, demand_veh, fraction, green_end_s)
+        terms = self.terms(state, green_s, demand_veh, fraction, green_end_s, held_s=held_s)
         # With delays under one step the inflow depends on itself round a circuit, and so does the room: sweep to
         # the fixed point that is reached from below.
         inflow, room = self.operations.minimum(terms.wanting_veh, terms.room_veh), terms.room_veh
@@ -350,11 +367,18 @@ class LinkModel:
         return replace(state, x_veh=state.x_veh + change)
 
     def terms(
-        self, state: ModelState, green_s: Any, demand_veh: Any, fraction: Any, green_end_s: Any | None = None
+        self,
+        state: ModelState,
+        green_s: Any,
+        demand_veh: Any,
+        fraction: Any,
+        green_end_s: Any | None = None,
+        *,
+        held_s: Any = 0.0,
     ) -> StepTerms:
         """What decides the flows of the step that `step` describes, all but the flows themselves."""
         ops = self.operations
-        turn_green_s = ops.matmul(self.served, green_s)
+        turn_green_s = ops.matmul(self.served, green_s) + held_s
         # Each turn's share of the room on the link that it feeds, among the turns that have green in this step;
         # exits have all the room in the world.
         open_fraction = fraction * ops.share(turn_green_s)
@@ -432,6 +456,8 @@ class GreenWindows:
 
     shown_s: Floats
     """(..., steps, S) seconds of green of each stage in each model step."""
+    held_s: Floats
+    """(..., steps, M) seconds of green that each turn has in clearances, or because no signal stops it."""
     end_s: Floats
     """(..., steps, M) end of each turn's last green in each model step, from the model step's start; 0 without one."""
 
@@ -451,20 +477,34 @@ def green_windows(network: Network, green_s: Floats, step_s: float) -> GreenWind
     into the yellow.
     """
     steps = round(network.control_step_s / step_s)
-    # All stages at once: (..., repetitions, S), then (..., steps, repetitions, S).
-    start = network.cycle_starts_s + (network.since_cycle_start_s(green_s) + network.startup_lag_s)[..., None, :]
+    stages, held = len(network.stages), network.held_greens
+    # Windows are the stages' greens and then the held ones: (..., S + held).
+    stage = np.concatenate([np.arange(stages), [each.stage for each in held]]).astype(np.int64)
+    since = network.since_cycle_start_s(green_s)
+    after = since[..., stage[stages:]] + green_s[..., stage[stages:]] + np.array([each.after_s for each in held])
+    since = np.concatenate([since, after], axis=-1) + network.startup_lag_s
+    lasts = np.concatenate([green_s, np.broadcast_to([each.duration_s for each in held], after.shape)], axis=-1)
+    # All at once: (..., repetitions, windows), then (..., steps, repetitions, windows).
+    start = network.cycle_starts_s[:, stage] + since[..., None, :]
     begin = np.arange(steps)[:, None, None] * step_s
-    closes = np.minimum((start + green_s[..., None, :])[..., None, :, :], begin + step_s) - begin
+    closes = np.minimum((start + lasts[..., None, :])[..., None, :, :], begin + step_s) - begin
     overlap = np.maximum(closes - np.maximum(start[..., None, :, :] - begin, 0.0), 0.0)
     # Cycles that do not divide the control step begin elsewhere in every one: what they show on average counts.
-    odd = network.control_step_s % network.cycle_s[network.stage_junction] > 0
+    cycle_s = network.cycle_s[network.stage_junction][stage]
+    odd = network.control_step_s % cycle_s > 0
     if odd.any():
-        usual = green_s * network.control_step_s / network.cycle_s[network.stage_junction]
+        usual = lasts * network.control_step_s / cycle_s
         shown = overlap.sum(axis=(-3, -2))
         scale = np.where(odd, usual / np.maximum(shown, 1e-9), 1.0)
         overlap = overlap * scale[..., None, None, :]
     last = np.where(overlap > 0, closes, 0.0).max(axis=-2)
-    stages, starts, turns = network.turn_stages
+    window, starts, turns = network.turn_windows
     by_turn = np.zeros((*last.shape[:-1], len(network.turns)))
-    by_turn[..., turns] = np.maximum.reduceat(last[..., stages], starts, axis=-1)
-    return GreenWindows(overlap.sum(axis=-2), by_turn)
+    if len(turns):
+        by_turn[..., turns] = np.maximum.reduceat(last[..., window], starts, axis=-1)
+    shown_s = overlap.sum(axis=-2)
+    held_s = np.zeros_like(by_turn)
+    for index, each in enumerate(held, start=stages):
+        held_s[..., list(each.turns)] += shown_s[..., index, None]
+    held_s[..., network.unsignalled] = by_turn[..., network.unsignalled] = step_s
+    return GreenWindows(shown_s[..., :stages], held_s, by_turn)

@@ -6,6 +6,7 @@ part of a signal cabinet that would switch to flashing yellow.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -13,9 +14,9 @@ from pathlib import Path
 from utn_sumo.contract import Junction, Network
 from utn_sumo.errors import ResultError
 
-LETTERS = frozenset("Ggyrsu")
+LETTERS = frozenset("GgyYrsu")
 """What a working signal shows; SUMO's o and O are signals switched off."""
-GREEN = "Gg"
+GREEN, YELLOW = "Gg", "yY"
 LONG_AGO_S = -(10**9)
 
 
@@ -41,9 +42,9 @@ class Verdict:
 def watch(network: Network, switches: Path, duration_s: float, begin_s: float = 0.0) -> Verdict:
     """Judge a run that began at `begin_s` by its record of signal switches (SUMO's SaveTLSSwitchStates).
 
-    Unsafe is: two conflicting streams with a protected green or with green against yellow; a green that ends
-    without its full yellow; a conflicting green before the clearance that the net prescribes has run; a green
-    shorter than the least; letters that no signal has; nothing shown at all.
+    Unsafe is: two conflicting streams with a protected green, or one with it while another's is still being cleared; a
+    green that ends without its full yellow; a conflicting green before the clearance that the net prescribes between
+    the two has run; a green shorter than the least; letters that no signal has; nothing shown at all.
     """
     shown = read_switches(switches)
     verdict = Verdict()
@@ -73,22 +74,66 @@ def _stretches(switches: list[tuple[int, str]], duration_s: int) -> list[tuple[s
     return [(state, range(start, min(end, duration_s))) for (start, state), (end, _) in pairwise(starts) if end > start]
 
 
+@dataclass(frozen=True)
+class _Rules:
+    """What the net's own programme shows between greens, with every stage as short as it may be."""
+
+    green_s: list[float]
+    """Least green of each signal."""
+    yellow_s: list[float]
+    """Least yellow after it."""
+    between_s: list[list[float]]
+    """Least time from the end of one signal's green to the begin of another's."""
+
+    @classmethod
+    def of(cls, network: Network, junction: Junction) -> _Rules:
+        """Read off the second and third of three cycles on end: what goes round the cycle is then seen whole."""
+        phases: list[tuple[str, float]] = []
+        for index in junction.stages:
+            stage = network.stages[index]
+            phases += [(stage.state, stage.min_green_s), *stage.clearance]
+        cycle_s = sum(seconds for _, seconds in phases)
+        size = len(junction.conflicts)
+        green, yellow = [math.inf] * size, [math.inf] * size
+        between = [[math.inf] * size for _ in range(size)]
+        lit, amber, ended = [0.0] * size, [0.0] * size, [-math.inf] * size
+        now_s, before = 0.0, "r" * size
+        for state, seconds in 3 * phases:
+            seen = now_s >= cycle_s
+            for signal, (was, now) in enumerate(zip(before, state, strict=True)):
+                if seen and now in GREEN and was not in GREEN:
+                    for foe in range(size):
+                        between[foe][signal] = min(between[foe][signal], now_s - ended[foe])
+                if was in GREEN and now not in GREEN:
+                    ended[signal] = now_s
+                    if seen:
+                        green[signal] = min(green[signal], lit[signal])
+                if seen and was in YELLOW and now not in YELLOW:
+                    yellow[signal] = min(yellow[signal], amber[signal])
+                lit[signal] = (lit[signal] if was in GREEN else 0.0) + seconds if now in GREEN else 0.0
+                amber[signal] = (amber[signal] if was in YELLOW else 0.0) + seconds if now in YELLOW else 0.0
+            now_s, before = now_s + seconds, state
+        # What the programme never shows it asks nothing of.
+        shown = [[0.0 if math.isinf(least_s) else least_s for least_s in row] for row in (green, yellow, *between)]
+        return cls(shown[0], shown[1], shown[2:])
+
+
 class _Guard:
     """Follows the signals of one junction through the seconds of a run."""
 
     def __init__(self, network: Network, junction: Junction, verdict: Verdict, begin_s: float) -> None:
-        clearances = [network.stages[stage].clearance for stage in junction.stages]
         self.junction = junction
         self.verdict = verdict
+        self.rules = _Rules.of(network, junction)
         self.under_way = (junction.offset_s - begin_s) % junction.cycle_s > 0
         """Whether a cycle is under way when the run begins: how long its green has lasted nobody saw."""
-        self.clearance_s = min(sum(seconds for _, seconds in clearance) for clearance in clearances)
-        self.yellow_s = min(sum(seconds for state, seconds in clearance if "y" in state) for clearance in clearances)
         size = len(junction.conflicts)
         self.foes = [[b for b in range(size) if junction.conflicts[a][b]] for a in range(size)]
         self.green_since = [0] * size
         self.yellow_since = [0] * size
         self.last_green = [LONG_AGO_S] * size
+        self.protected = [False] * size
+        """Whether a signal has its protected green, or the yellow that clears it."""
 
     def judge(self, stretches: list[tuple[str, range]]) -> None:
         """Look at every second in turn; signals change only where a stretch begins."""
@@ -99,7 +144,9 @@ class _Guard:
                 self._flag_all(seconds, f"shows {state!r}")
                 previous = dark
                 continue
-            if clash := _clash(state, self.foes):
+            for signal, letter in enumerate(state):
+                self.protected[signal] = letter == "G" or (letter in YELLOW and self.protected[signal])
+            if clash := self._clash(state):
                 self._flag_all(seconds, "signals {} and {} conflict and are open together".format(*clash))
             for signal, (was, now) in enumerate(zip(previous, state, strict=True)):
                 if reason := self._change(signal, was, now, seconds.start, state):
@@ -115,27 +162,28 @@ class _Guard:
 
     def _change(self, signal: int, was: str, now: str, second: int, state: str) -> str:
         """What is wrong with one signal's change at this second; empty if nothing is."""
+        rules = self.rules
         if now in GREEN and was not in GREEN:
             self.green_since[signal] = LONG_AGO_S if second == 0 and self.under_way else second
             for foe in self.foes[signal]:
-                if now == "G" and state[foe] == "r" and second - self.last_green[foe] - 1 < self.clearance_s:
+                since_s = second - self.last_green[foe] - 1
+                if now == "G" and state[foe] not in GREEN and since_s < rules.between_s[foe][signal]:
                     return f"turns green too soon after signal {foe}"
         elif was in GREEN and now not in GREEN:
             self.yellow_since[signal] = second
-            if now != "y":
+            if now == "r" and signal not in self.junction.without_yellow:
                 return f"goes from green to {now!r} without yellow"
-            if second - self.green_since[signal] < self.junction.min_green_s:
+            if second - self.green_since[signal] < rules.green_s[signal]:
                 return "was green for less than its least"
-        if was == "y" and now != "y" and second - self.yellow_since[signal] < self.yellow_s:
+        if was in YELLOW and now not in YELLOW and second - self.yellow_since[signal] < rules.yellow_s[signal]:
             return "had too little yellow"
         return ""
 
-
-def _clash(state: str, foes: list[list[int]]) -> tuple[int, int] | None:
-    """A pair of conflicting streams that are open at once: both protected, or one while the other clears."""
-    for signal, letter in enumerate(state):
-        if letter == "G":
-            for foe in foes[signal]:
-                if state[foe] in "Gy":
-                    return signal, foe
-    return None
+    def _clash(self, state: str) -> tuple[int, int] | None:
+        """A pair of conflicting streams, one with a protected green, one with that or still being cleared from it."""
+        for signal, letter in enumerate(state):
+            if letter == "G":
+                for foe in self.foes[signal]:
+                    if self.protected[foe]:
+                        return signal, foe
+        return None

@@ -227,6 +227,7 @@ def _log(net: Network, states: Sequence[State], passed: Sequence[Passed], foreca
         "fraction": [state.fraction for state in before],
         "green_s": [each.green_s for each in passed],
         "forecast_veh": [ahead.demand_veh[0] for ahead in forecasts],
+        "forecast_disturbance_veh": [ahead.outside_veh[1][0] for ahead in forecasts],
         "entered_by_sample_veh": [each.entered_veh for each in passed],
         "turned_veh": [state.turned_veh for state in after],
         "true_x_veh": [state.x_veh for state in after],

@@ -135,6 +135,8 @@ class Log:
     """(K, runs, S) greens that were applied."""
     forecast_veh: Floats
     """(K, runs, Z) demand that was forecast for the step."""
+    forecast_disturbance_veh: Floats
+    """(K, runs, Z) who was forecast to come onto each link amid it in the step, less those to end there."""
     entered_by_sample_veh: Floats
     """(K, runs, P, Z) counted into each link, by sample."""
     turned_veh: Floats
@@ -180,6 +182,10 @@ def read_log(folder: Path) -> Log:
             name: np.array([functools.reduce(lambda at, key: at[key], path, record) for record in records], dtype=float)
             for name, path in places.items()
         }
+        foreseen = [record["forecast"]["disturbance_veh"] for record in records]
+        columns["forecast_disturbance_veh"] = np.array(
+            [np.zeros(columns["x_veh"].shape[1]) if ahead is None else ahead[0] for ahead in foreseen], dtype=float
+        )
     except (OSError, UnicodeDecodeError, ValueError, KeyError, IndexError, TypeError) as error:
         raise ResultError(f"{str(folder)!r} holds no readable {CYCLES}: give a folder that `utn run` wrote") from error
     return Log(**{name: column[:, None] for name, column in columns.items()})

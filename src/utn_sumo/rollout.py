@@ -56,25 +56,50 @@ def observe(model: LinkModel, log: Log, at: Ints, source_queue_veh: Floats) -> M
     return ModelState(x, split * model.at_turns(queue), source_queue_veh[at], past_inflow)
 
 
-def predict(
-    model: LinkModel, log: Log, horizon: int, *, demand_veh: Floats, source_queue_veh: Floats, fraction: Floats
-) -> Prediction:
+@dataclass(frozen=True)
+class Outside:
+    """What the network's surroundings do: arrays (K, runs, Z) by control step."""
+
+    demand_veh: Floats
+    """What wants to enter each source link."""
+    source_queue_veh: Floats
+    """Who waits outside at the start of the step."""
+    disturbance_veh: Floats
+    """Who comes onto each link amid it, less those who end there (e_z of SPEC 2.1)."""
+
+    @classmethod
+    def known(cls, network: Network, log: Log) -> Outside:
+        """As it really was."""
+        waiting = np.concatenate([np.zeros_like(log.true_waiting_veh[:1]), log.true_waiting_veh[:-1]])
+        demand = (log.entered_veh + log.true_waiting_veh - waiting) * network.is_source
+        before = np.concatenate([np.zeros_like(log.true_x_veh[:1]), log.true_x_veh[:-1]])
+        left = log.turned_veh @ _by_link(network).T
+        return cls(demand, waiting, log.true_x_veh - before - log.entered_veh + left)
+
+    @classmethod
+    def foreseen(cls, log: Log) -> Outside:
+        """As it was forecast and estimated at the time."""
+        return cls(log.forecast_veh, log.source_queue_veh, log.forecast_disturbance_veh)
+
+
+def predict(model: LinkModel, log: Log, horizon: int, *, outside: Outside, fraction: Floats) -> Prediction:
     """Predict `horizon` control steps from each of `starts(log, horizon)` under the greens of the log.
 
-    `demand_veh` (K, runs, Z) is what wants to enter each source link in each control step, `source_queue_veh` (K, runs,
-    Z) who waits outside at its start, `fraction` (H, starts, runs, M) how the traffic turns in each step ahead.
+    `fraction` (H, starts, runs, M) is how the traffic turns in each step ahead.
     """
     at = starts(log, horizon)
-    state = observe(model, log, at, source_queue_veh)
+    state = observe(model, log, at, outside.source_queue_veh)
     windows = green_windows(model.network, log.green_s, model.step_s)
     steps = windows.shown_s.shape[-2]
     x, queue, inflow = [], [], []
     for ahead in range(horizon):
         entered: Floats = np.zeros_like(state.x_veh)
         for step in range(steps):
-            shown, end = windows.shown_s[at + ahead, :, step], windows.end_s[at + ahead, :, step]
+            shown, held, end = (each[at + ahead, :, step] for each in (windows.shown_s, windows.held_s, windows.end_s))
             flows: StepFlows
-            state, flows = model.step(state, shown, demand_veh[at + ahead] / steps, fraction[ahead], end)
+            state = model.disturbed(state, outside.disturbance_veh[at + ahead] / steps)
+            demand_veh = outside.demand_veh[at + ahead] / steps
+            state, flows = model.step(state, shown, demand_veh, fraction[ahead], end, held_s=held)
             entered = entered + flows.inflow_veh
         x.append(state.x_veh)
         queue.append(model.by_link(state.q_veh))
@@ -82,19 +107,15 @@ def predict(
     return Prediction(np.array(x), np.array(queue), np.array(inflow))
 
 
-def known_demand_veh(network: Network, log: Log) -> Floats:
-    """(K, runs, Z) vehicles that really wanted to enter each source link in each control step."""
-    return np.asarray((log.entered_veh + log.true_waiting_veh - known_source_queue_veh(log)) * network.is_source)
-
-
-def known_source_queue_veh(log: Log) -> Floats:
-    """(K, runs, Z) vehicles that really waited outside at the start of each control step."""
-    return np.concatenate([np.zeros_like(log.true_waiting_veh[:1]), log.true_waiting_veh[:-1]])
-
-
 def known_fraction(network: Network, log: Log) -> Floats:
     """(K, runs, M) how the traffic that left each link in each control step really turned."""
-    by_link = np.zeros((len(network.links), len(network.turns)))
-    by_link[network.turn_link, np.arange(len(network.turns))] = 1
+    by_link = _by_link(network)
     left = log.turned_veh @ by_link.T @ by_link
     return np.asarray(np.where(left > 0, log.turned_veh / np.where(left > 0, left, 1.0), network.fraction))
+
+
+def _by_link(network: Network) -> Floats:
+    """(Z, M) 1 where a turn leaves a link."""
+    by_link = np.zeros((len(network.links), len(network.turns)))
+    by_link[network.turn_link, np.arange(len(network.turns))] = 1
+    return by_link

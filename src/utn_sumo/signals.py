@@ -6,7 +6,6 @@ SUMO shows whatever it is told, all-green and NaN included, so nothing reaches i
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -33,11 +32,12 @@ def admit(plan: Plan, network: Network) -> Plan:
         raise PlanError(f"plan is not finite at stage {int(np.flatnonzero(~np.isfinite(green_s))[0])}")
     for index, junction in enumerate(network.junctions):
         stages = list(junction.stages)
-        short = green_s[stages].min()
-        if short < junction.min_green_s - TOLERANCE_S:
-            raise PlanError(
-                f"junction {junction.id}: green of {short:g} s is under the {junction.min_green_s:g} s least"
-            )
+        for stage in stages:
+            least_s = network.stages[stage].min_green_s
+            if green_s[stage] < least_s - TOLERANCE_S:
+                raise PlanError(
+                    f"junction {junction.id}: green of {green_s[stage]:g} s is under the {least_s:g} s least"
+                )
         total, budget = green_s[stages].sum(), network.green_budget_s[index]
         if abs(total - budget) > TOLERANCE_S * len(stages):
             raise PlanError(f"junction {junction.id}: greens sum to {total:g} s, its cycle leaves {budget:g} s")
@@ -90,17 +90,26 @@ def check_programme(network: Network, junction: int, phases: list[tuple[str, flo
             raise PlanError(f"junction {item.id}: phase of {duration:g} s, whole seconds from 1 on are needed")
         if len(state) != len(item.signal_turn):
             raise PlanError(f"junction {item.id}: {len(state)} letters for {len(item.signal_turn)} signals")
-        _refuse_conflict(item, state)
     states = [state for state, _ in phases]
-    for before, after in pairwise([*states, states[0]]):
-        for signal, (was, becomes) in enumerate(zip(before, after, strict=True)):
-            if was in "Gg" and becomes == "r":
+    before = states[-1]
+    protected = [False] * len(before)
+    # Twice round: what the first green of a cycle follows is the last clearance.
+    for state in [*states, *states]:
+        for signal, (was, becomes) in enumerate(zip(before, state, strict=True)):
+            if was in "Gg" and becomes == "r" and signal not in item.without_yellow:
                 raise PlanError(f"junction {item.id}: signal {signal} goes from green to red without yellow")
+            protected[signal] = becomes == "G" or (protected[signal] and becomes in "yY")
+        _refuse_conflict(item, state, protected)
+        before = state
 
 
-def _refuse_conflict(junction: Junction, state: str) -> None:
-    open_ = [signal for signal, letter in enumerate(state) if letter in "Gy"]
-    for a, b in combinations(open_, 2):
-        if junction.conflicts[a][b] and "G" in state[a] + state[b]:
-            both = "are both green" if state[a] == state[b] else "are open together, one of them still clearing"
-            raise PlanError(f"junction {junction.id}: signals {a} and {b} conflict and {both}")
+def _refuse_conflict(junction: Junction, state: str, protected: list[bool]) -> None:
+    """Raise PlanError for a protected green against another, or against the yellow that clears one.
+
+    Who had green without protection yields while its yellow clears it, as it did before.
+    """
+    for a in (signal for signal, letter in enumerate(state) if letter == "G"):
+        for b, foe in enumerate(junction.conflicts[a]):
+            if foe and protected[b]:
+                both = "are both green" if state[b] == "G" else "are open together, one of them still clearing"
+                raise PlanError(f"junction {junction.id}: signals {min(a, b)} and {max(a, b)} conflict and {both}")

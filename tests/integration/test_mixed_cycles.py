@@ -13,7 +13,7 @@ import pytest
 from utn_sumo import bridge, calibration, network, recording
 from utn_sumo.contract import EXIT, Floats, Network
 from utn_sumo.model import LinkModel, green_windows
-from utn_sumo.rollout import known_demand_veh, known_source_queue_veh, observe
+from utn_sumo.rollout import Outside, observe
 from utn_sumo.scenario import scenario
 
 CYCLES_S = {"J1": 120, "J2": 60, "J3": 90, "J4": 60, "J5": 120, "J6": 90, "J7": 60, "J8": 90}
@@ -86,14 +86,14 @@ def model_inflow_veh(net: Network, folder: Path, step_s: float) -> tuple[Floats,
     log = recording.read_log(folder)
     model = LinkModel(net, step_s)
     windows = green_windows(net, log.green_s, step_s)
-    demand, waiting = known_demand_veh(net, log), known_source_queue_veh(log)
+    outside = Outside.known(net, log)
     steps = windows.shown_s.shape[-2]
     predicted = []
     for k in range(1, len(log.green_s)):
-        state = observe(model, log, np.array([k]), waiting)
+        state = observe(model, log, np.array([k]), outside.source_queue_veh)
         for step in range(steps):
             shown, end = windows.shown_s[k, :, step], windows.end_s[k, :, step]
-            state, flows = model.step(state, shown, demand[k] / steps, log.fraction[k], end)
+            state, flows = model.step(state, shown, outside.demand_veh[k] / steps, log.fraction[k], end)
             predicted += [flows.inflow_veh[0, 0] * SAMPLE_S / step_s] * round(step_s / SAMPLE_S)
     return np.array(predicted), np.concatenate(log.entered_by_sample_veh[1:, 0])
 

@@ -25,9 +25,10 @@ def random_plan(network: Network, rng: np.random.Generator) -> Plan:
     green_s = np.zeros(len(network.stages))
     for junction, budget_s in zip(network.junctions, network.green_budget_s, strict=True):
         stages = list(junction.stages)
-        spare_s = int(budget_s - junction.min_green_s * len(stages))
+        least_s = network.min_green_s[stages]
+        spare_s = int(budget_s - least_s.sum())
         cuts = np.sort(rng.integers(0, spare_s + 1, len(stages) - 1))
-        green_s[stages] = junction.min_green_s + np.diff([0, *cuts, spare_s])
+        green_s[stages] = least_s + np.diff([0, *cuts, spare_s])
     return Plan(green_s)
 
 

@@ -39,7 +39,7 @@ def over_step(net: Network, entered_veh: Floats) -> Floats:
 
 def occupancy(net: Network, entered_veh: Floats, cover_s: Floats | float) -> Floats:
     """Of the entry loops, when each vehicle covers them for so long."""
-    lanes = np.array([net.edge_lanes[link.edges[0]] for link in net.links])
+    lanes = np.array([len(net.edge_lanes[link.edges[0]]) for link in net.links])
     return np.asarray(np.minimum(entered_veh * cover_s / (lanes * net.control_step_s), 1.0))
 
 
@@ -48,7 +48,8 @@ def counted(net: Network, *, entered: Floats | None = None, **readings: Floats) 
     links = each(net, 0.0)
     entered = links if entered is None else entered
     samples = entered if entered.ndim == 2 else over_step(net, entered)
-    rest = dict.fromkeys(("queue_veh", "seen_veh", "stop_line_occupancy"), links)
+    rest = dict.fromkeys(("queue_veh", "seen_veh", "beside_veh", "stop_line_occupancy"), links)
+    rest["group_queue_veh"] = np.zeros(len(net.groups))
     covered = occupancy(net, samples.sum(axis=0), FREE_COVER_S)
     every = {**rest, "entered_veh": samples, "entry_occupancy": covered, "turned_veh": np.zeros(len(net.turns))}
     return Measurement(time_s=120.0, **{**every, **readings})

@@ -140,8 +140,17 @@ def test_smooth_windows_are_the_green_windows(utn17: Network, step_s: float) -> 
     import casadi as ca
 
     shifted = replace(utn17, junctions=tuple(replace(each, offset_s=35.0) for each in utn17.junctions))
+    # A turn that stays green through the clearance of its stage, one that is early for the next, and one unsignalled.
+    holding = replace(utn17.stages[0], held=(utn17.stages[0].turns[:1], utn17.stages[1].turns[:1]))
+    held = replace(
+        utn17,
+        stages=(holding, *(replace(s, turns=tuple(t for t in s.turns if t != 5)) for s in utn17.stages[1:])),
+        junctions=tuple(
+            replace(j, signal_turn=tuple(-1 if t == 5 else t for t in j.signal_turn)) for j in shifted.junctions
+        ),
+    )
     rng = np.random.default_rng(8)
-    for net in (utn17, shifted):
+    for net in (utn17, shifted, held):
         model, green = LinkModel(net, step_s, SmoothOperations(1e-4, 1e-4)), ca.SX.sym("green", len(net.stages))
         steps = range(round(net.control_step_s / step_s))
         symbols = ca.Function(
@@ -149,9 +158,11 @@ def test_smooth_windows_are_the_green_windows(utn17: Network, step_s: float) -> 
         )
         green_s = random_greens(net, rng)
         exact, found = green_windows(net, green_s, step_s), [np.array(each).ravel() for each in symbols(green_s)]
-        assert np.array(found[::2]) == pytest.approx(exact.shown_s, abs=1e-3)
-        clear = exact.shown_s @ net.serves > 1.5
-        assert np.array(found[1::2])[clear] == pytest.approx(exact.end_s[clear], abs=1e-3)
+        assert np.array(found[::3]) == pytest.approx(exact.shown_s, abs=1e-3)
+        assert np.array(found[1::3]) == pytest.approx(exact.held_s, abs=1e-3)
+        tiny = ((exact.shown_s > 0) & (exact.shown_s < 1.5)) @ net.serves > 0
+        clear = (exact.end_s > 0) & ~tiny & ((exact.held_s == 0) | (exact.held_s > 1.5))
+        assert np.array(found[2::3])[clear] == pytest.approx(exact.end_s[clear], abs=1e-3)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -198,7 +209,7 @@ def test_an_answer_that_the_solver_does_not_vouch_for_is_none(utn17: Network, mo
 
 def test_greens_that_fit_no_cycle_are_an_error_in_one_line(utn17: Network) -> None:
     # Three stages of 40 s and more in a cycle that leaves 105 s.
-    junctions = (replace(utn17.junctions[0], min_green_s=40.0), *utn17.junctions[1:])
-    crowded = ExactProblem(replace(utn17, junctions=junctions), settings_of("tts", horizon=1))
+    stages = tuple(replace(each, min_green_s=40.0) if each.junction == 0 else each for each in utn17.stages)
+    crowded = ExactProblem(replace(utn17, stages=stages), settings_of("tts", horizon=1))
     with pytest.raises(ControllerError, match=r"impossible \(.*LBX.*\)$"):
         crowded.solve(*some_case(utn17, 0), equal_greens(utn17, 1))

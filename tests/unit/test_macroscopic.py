@@ -125,7 +125,7 @@ def test_a_fitted_wish_fills_its_cycles_in_its_own_proportions(utn17: Network, s
         admit(Plan(fitted), utn17)
         for junction, budget in zip(utn17.junctions, utn17.green_budget_s, strict=True):
             stages = list(junction.stages)
-            free = fitted[stages] > junction.min_green_s + 1e-6
+            free = fitted[stages] > utn17.min_green_s[stages] + 1e-6
             assert fitted[stages].sum() == pytest.approx(budget)
             share = wish[stages][free] / fitted[stages][free]
             assert share == pytest.approx(share.max(), abs=1e-4)

@@ -13,7 +13,7 @@ from utn_sumo.contract import Floats, Network
 from utn_sumo.mismatch import errors, rmse, summary
 from utn_sumo.model import LinkModel, ModelState, green_windows
 from utn_sumo.recording import Log
-from utn_sumo.rollout import known_demand_veh, known_fraction, known_source_queue_veh, observe, predict, starts
+from utn_sumo.rollout import Outside, known_fraction, observe, predict, starts
 
 STEPS = 14
 
@@ -44,6 +44,7 @@ def simulated(network: Network, seed: int) -> Log:
         "source_queue_veh": [s.source_queue_veh for s in states],
         "fraction": [network.fraction] * STEPS,
         "green_s": [green] * STEPS,
+        "forecast_disturbance_veh": [np.zeros(links)] * STEPS,
         "forecast_veh": [rows.sum(axis=0) for rows in entered],
         "entered_by_sample_veh": entered,
         "turned_veh": turned,
@@ -63,10 +64,9 @@ def test_where_the_plant_is_the_model_prediction_is_all_but_exact(utn17: Network
 
 
 def predicted(network: Network, log: Log, horizon: int, step_s: float = 10.0) -> Floats:
-    demand, waiting = known_demand_veh(network, log), known_source_queue_veh(log)
     fraction = np.array([log.fraction[starts(log, horizon)]] * horizon)
     model = LinkModel(network, step_s)
-    return predict(model, log, horizon, demand_veh=demand, source_queue_veh=waiting, fraction=fraction).x_veh
+    return predict(model, log, horizon, outside=Outside.known(network, log), fraction=fraction).x_veh
 
 
 def test_a_step_of_the_whole_cycle_knows_where_the_green_stands(utn17: Network) -> None:

@@ -116,13 +116,13 @@ class ExactProblem:
         for step in range(self.settings.horizon * self._substeps):
             control_step, substep = divmod(step, self._substeps)
             green = greens[:, min(control_step, self.settings.control_horizon - 1)]
-            shown_s, end_s = smooth_windows(model, green, substep * model.step_s)
+            shown_s, held_s, end_s = smooth_windows(model, green, substep * model.step_s)
             demand_veh, disturbance_veh = (each[:, control_step] / self._substeps for each in outside)
             inflow, room = ca.SX.sym(f"inflow{step}", links), ca.SX.sym(f"room{step}", links)
             x, q, waiting = ca.SX.sym(f"x{step}", links), ca.SX.sym(f"q{step}", turns), ca.SX.sym(f"w{step}", links)
             # Without the bounds of `LinkModel.disturbed`, whose rounding would tell on every step.
             state = replace(state, x_veh=state.x_veh + disturbance_veh)
-            flows = model.flows(model.terms(state, shown_s, demand_veh, fraction, end_s), inflow, room)
+            flows = model.flows(model.terms(state, shown_s, demand_veh, fraction, end_s, held_s=held_s), inflow, room)
             after = model.after(state, demand_veh, flows)
             variables += [inflow, room, x, q, waiting]
             rows += [flows.inflow_veh - inflow, flows.open_room_veh - room]
@@ -197,34 +197,47 @@ class ExactProblem:
         }
 
 
-def smooth_windows(model: LinkModel, green_s: Any, begin_s: float) -> tuple[Any, Any]:
-    """`green_windows` of the model step that begins at `begin_s` as symbols: seconds shown (S,), ends by turn (M,).
+def smooth_windows(model: LinkModel, green_s: Any, begin_s: float) -> tuple[Any, Any, Any]:
+    """`green_windows` of the model step that begins at `begin_s` as symbols: shown (S,), held (M,), ends by turn (M,).
 
     `green_s` (S,) is a column of symbols, `model` one of rounded operations. The end of a green that is not shown is
     of no account.
     """
     ops, net = model.operations, model.network
-    # Where a stage stands is the sum of what goes before it in its cycle: affine in the greens.
-    alone = net.since_cycle_start_s(np.zeros(len(net.stages)))
-    before = net.since_cycle_start_s(np.eye(len(net.stages))) - alone
-    since = alone + net.startup_lag_s - begin_s + ops.matmul(sp.csr_array(before.T), green_s)
+    stages, held = len(net.stages), net.held_greens
+    stage = np.concatenate([np.arange(stages), [each.stage for each in held]]).astype(np.int64)
+    # Where a window stands is the sum of what goes before it in its cycle: affine in the greens, as is its length.
+    alone = net.since_cycle_start_s(np.zeros(stages))
+    before = net.since_cycle_start_s(np.eye(stages)).T - alone[:, None]
+    own, follows = np.eye(stages)[stage], np.arange(len(stage)) >= stages
+    after_s, lasts_s = (np.zeros(len(stage)) for _ in range(2))
+    after_s[stages:], lasts_s[stages:] = [each.after_s for each in held], [each.duration_s for each in held]
+    since = ops.matmul(sp.csr_array(before[stage] + own * follows[:, None]), green_s)
+    since = since + alone[stage] + after_s + net.startup_lag_s - begin_s
+    lasts = ops.matmul(sp.csr_array(own * ~follows[:, None]), green_s) + lasts_s
     shown: Any = 0
     last: Any = 0
-    for cycle_start_s in net.cycle_starts_s:
+    for cycle_start_s in net.cycle_starts_s[:, stage]:
         opens = since + cycle_start_s
-        closes = ops.minimum(opens + green_s, model.step_s)
+        closes = ops.minimum(opens + lasts, model.step_s)
         overlap = ops.maximum(closes - ops.maximum(opens, 0.0), 0.0)
         shown = shown + overlap
         last = ops.maximum(last, closes * ops.share(overlap))
-    stages, starts, turns = net.turn_stages
-    counts = np.diff([*starts, len(stages)])
-    end: Any = 0
-    for position in range(counts.max()):
+    window, starts, turns = net.turn_windows
+    counts = np.diff([*starts, len(window)])
+    free = net.unsignalled.astype(float) * model.step_s
+    shape = (len(net.turns), len(stage))
+    end: Any = free
+    for position in range(counts.max(initial=0)):
         there = counts > position
-        picked = turns[there], stages[starts[there] + position]
-        each = sp.csr_array((np.ones(len(picked[0])), picked), shape=model.served.shape)
-        end = ops.maximum(end, ops.matmul(each, last))
-    return shown, end
+        picked = turns[there], window[starts[there] + position]
+        end = ops.maximum(end, ops.matmul(sp.csr_array((np.ones(len(picked[0])), picked), shape=shape), last))
+    turn, piece = (
+        [turn for each in held for turn in each.turns],
+        [p for p, each in enumerate(held, stages) for _ in each.turns],
+    )
+    holds = sp.csr_array((np.ones(len(turn)), (turn, piece)), shape=shape)
+    return shown[:stages], ops.matmul(holds, shown) + free, end
 
 
 def rolled_out_cost(
@@ -248,7 +261,9 @@ def _roll_out(
         at = min(step // substeps, len(greens_s) - 1), step % substeps
         demand_veh, disturbance_veh = (each[step // substeps] / substeps for each in forecast.outside_veh)
         now = model.disturbed(states[-1], disturbance_veh)
-        after, moved = model.step(now, windows.shown_s[at], demand_veh, state.fraction, windows.end_s[at])
+        after, moved = model.step(
+            now, windows.shown_s[at], demand_veh, state.fraction, windows.end_s[at], held_s=windows.held_s[at]
+        )
         states.append(after)
         flows.append(moved)
     return states, flows

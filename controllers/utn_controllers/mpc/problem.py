@@ -74,6 +74,8 @@ class Timing:
 
     shown: Floats
     """(n, S) seconds of green in each model step for a second of the planned green."""
+    held_s: Floats
+    """(n, M) green of each turn that no plan changes (`GreenWindows.held_s`)."""
     end_s: Floats
     """(n, M) when each turn's last green ends, from the model step's start."""
     opening: Floats
@@ -86,8 +88,9 @@ class Timing:
     def of(cls, model: LinkModel, green_s: Floats, delay_s: Floats | None = None) -> Timing:
         """The timing of the plan `green_s` (S,) on the model's network and step."""
         windows = green_windows(model.network, green_s, model.step_s)
-        by_turn = model.operations.matmul(model.served, windows.shown_s)
-        return cls(windows.shown_s / green_s, windows.end_s, model.opening(by_turn, windows.end_s), delay_s)
+        by_turn = model.operations.matmul(model.served, windows.shown_s) + windows.held_s
+        opening = model.opening(by_turn, windows.end_s)
+        return cls(windows.shown_s / green_s, windows.held_s, windows.end_s, opening, delay_s)
 
     @classmethod
     def joined(cls, timings: Sequence[Timing], places: Sequence[Place]) -> Timing:
@@ -100,6 +103,7 @@ class Timing:
         known = [delay for delay in delays if delay is not None]
         return cls(
             np.concatenate([timing.shown for timing in timings], axis=1)[:, stages],
+            np.concatenate([timing.held_s for timing in timings], axis=1)[:, turns],
             np.concatenate([timing.end_s for timing in timings], axis=1)[:, turns],
             np.concatenate([timing.opening for timing in timings], axis=1)[:, turns],
             np.concatenate(known, axis=1)[:, links] if len(known) == len(delays) else None,
@@ -108,7 +112,8 @@ class Timing:
     def part(self, place: Place) -> Timing:
         """What of the whole network's timing concerns one junction."""
         delay_s = None if self.delay_s is None else self.delay_s[:, place.links]
-        return Timing(self.shown[:, place.stages], self.end_s[:, place.turns], self.opening[:, place.turns], delay_s)
+        held_s, end_s, opening = (each[:, place.turns] for each in (self.held_s, self.end_s, self.opening))
+        return Timing(self.shown[:, place.stages], held_s, end_s, opening, delay_s)
 
 
 def _share(number: Any) -> Floats:
@@ -194,6 +199,7 @@ class JunctionProblem:
             share,
             still_in_green,
             timing.shown,
+            timing.held_s,
             timing.opening,
             # A source that holds more than it can, by a wrong count, may go on holding it.
             part.is_source * np.maximum(x - part.storage_veh, 0.0),

@@ -78,6 +78,7 @@ class Structure:
     lags: int
     """Model steps back from which somebody can still be on the way."""
     turn_link: tuple[int, ...]
+    turn_group: tuple[int, ...]
     stage_turns: tuple[tuple[int, ...], ...]
     is_source: tuple[bool, ...]
     example: Network = field(compare=False)
@@ -94,6 +95,7 @@ class Structure:
             substeps=substeps,
             lags=min(int(np.ceil(part.free_time_s.max() / step_s)), settings.horizon * substeps),
             turn_link=tuple(part.turn_link.tolist()),
+            turn_group=tuple(part.turn_group.tolist()),
             stage_turns=tuple(stage.turns for stage in part.stages),
             is_source=tuple(part.is_source.tolist()),
             example=part,
@@ -166,6 +168,7 @@ class Statement:
             "share_in_green": over("share_in_green", structure.steps * (structure.lags + 1), turns),
             "still_in_green": over("still_in_green", structure.lags, turns),
             "shown": over("shown", structure.substeps, stages),
+            "held": over("held", structure.substeps, turns),
             "opening": over("opening", structure.substeps, turns),
             "excess": ca.SX.sym("excess", links),
             "saturation": ca.SX.sym("saturation", turns),
@@ -188,6 +191,7 @@ class Statement:
         share_in_green: list[Any],
         still_in_green: list[Any],
         shown: list[Any],
+        held: list[Any],
         opening: list[Any],
         excess: Any,
         saturation: Any,
@@ -222,7 +226,7 @@ class Statement:
                 in_time = in_time - still_in_green[step]
             for lag, entered in enumerate(inflows):
                 in_time = in_time - share_in_green[step * lags + lag] * model.at_turns(entered)
-            by_turn_s = model.operations.matmul(model.served, green * shown[substep])
+            by_turn_s = model.operations.matmul(model.served, green * shown[substep]) + held[substep]
             # The three terms of SPEC 2.3, the third as the consumer's: it knows its storage.
             rows += [
                 (leaving - q - fraction * in_time, -np.inf, 0.0),

@@ -98,8 +98,8 @@ class MacroscopicPlant:
             before.x_veh, before.q_veh, before.source_queue_veh, tuple(before.past_inflow_veh[: model.lags])
         )
         entered, turned, x, queue, present_veh = [], np.zeros(len(network.turns)), [], [], 0.0
-        for shown_s, end_s in zip(windows.shown_s, windows.end_s, strict=True):
-            now, flows = model.step(now, shown_s, demand_veh, before.fraction, end_s)
+        for shown_s, held_s, end_s in zip(windows.shown_s, windows.held_s, windows.end_s, strict=True):
+            now, flows = model.step(now, shown_s, demand_veh, before.fraction, end_s, held_s=held_s)
             entered.append(flows.inflow_veh)
             turned = turned + flows.leaving_veh
             x.append(now.x_veh)

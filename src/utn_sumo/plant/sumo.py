@@ -236,6 +236,8 @@ class SumoPlant:
             entered_veh=np.array(by_sample).T,
             turned_veh=_total(counted, self._ids.turn),
             queue_veh=_total(area.getLastStepHaltingNumber, self._ids.area),
+            group_queue_veh=_total(area.getLastStepHaltingNumber, self._ids.group),
+            beside_veh=_total(counted, self._ids.joining) - _total(counted, self._ids.parting),
             seen_veh=_total(area.getLastStepVehicleNumber, self._ids.area),
             entry_occupancy=occupancy(self._ids.entry),
             stop_line_occupancy=occupancy(self._ids.stop_line),

@@ -1,0 +1,171 @@
+"""Signal programmes of a net and of additional files, and how they are cut into stages and clearances.
+
+A stage is a phase that shows green and no yellow. What follows it up to the next stage is its clearance, taken from the
+net and never optimised: yellow, all-red, red and yellow, and short remnants of the green before, such as the seconds
+in which the pedestrians of a crossing have red already and the cars beside them still have green. A phase under five
+seconds is never a stage: nobody could use it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import Any
+
+from utn_sumo.errors import NetworkError
+from utn_sumo.xml_files import opened
+
+MIN_GREEN_S = 10.0
+"""Least green of a stage for which the net names none, if it shows the stage as long itself."""
+SHORTEST_STAGE_S = 5.0
+GREEN, YELLOW, OFF = "Gg", "yYu", "oO"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One phase of a programme."""
+
+    state: str
+    duration_s: float
+    least_s: float | None = None
+    """`minDur`, where the programme has it."""
+
+    @property
+    def green(self) -> frozenset[int]:
+        """Signals that it opens."""
+        return frozenset(signal for signal, letter in enumerate(self.state) if letter in GREEN)
+
+    @property
+    def is_plain_green(self) -> bool:
+        """Whether it shows green and no yellow."""
+        return bool(self.green) and not any(letter in YELLOW for letter in self.state)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A stage's phase and its clearance."""
+
+    stage: Phase
+    clearance: tuple[Phase, ...]
+
+    @property
+    def min_green_s(self) -> float:
+        """Least green of the stage: what the net says, else `MIN_GREEN_S`, but no more than the net itself shows."""
+        wished_s = MIN_GREEN_S if self.stage.least_s is None else self.stage.least_s
+        return float(math.ceil(max(1.0, min(wished_s, self.stage.duration_s))))
+
+
+@dataclass(frozen=True)
+class Programme:
+    """A signal programme, its phases alike in a row as one."""
+
+    phases: tuple[Phase, ...]
+    offset_s: float
+
+    @classmethod
+    def of(cls, phases: Iterable[Phase], offset_s: float) -> Programme:
+        """Of the phases as they are written."""
+        grouped = [list(group) for _, group in groupby(phases, key=lambda phase: phase.state)]
+        if len(grouped) > 1 and grouped[0][0].state == grouped[-1][0].state:
+            # A phase that goes on round the cycle is one.
+            last = grouped.pop()
+            grouped[0] = [*last, *grouped[0]]
+            offset_s -= sum(phase.duration_s for phase in last)
+        return cls(tuple(_merged(group) for group in grouped), offset_s)
+
+    @property
+    def cycle_s(self) -> float:
+        """Its length."""
+        return sum(phase.duration_s for phase in self.phases)
+
+    @property
+    def opens(self) -> list[int]:
+        """Which phases are stages."""
+        around = [self.phases[-1:], *([phase] for phase in self.phases[:-1])] if self.phases else []
+        return [
+            index
+            for index, (phase, (before,)) in enumerate(zip(self.phases, around, strict=True))
+            if phase.is_plain_green and not _is_remnant(phase, before)
+        ]
+
+    @property
+    def begin_s(self) -> float:
+        """When in its cycle its first stage begins."""
+        return sum(phase.duration_s for phase in self.phases[: self.opens[0]])
+
+    @property
+    def blocks(self) -> list[Block]:
+        """Its stages with their clearances, from the first stage on round the cycle."""
+        first = self.opens[0]
+        turned = [*self.phases[first:], *self.phases[:first]]
+        starts = [index - first for index in self.opens]
+        return [Block(turned[a], tuple(turned[a + 1 : b])) for a, b in pairwise([*starts, len(turned)])]
+
+
+def _merged(group: Sequence[Phase]) -> Phase:
+    least = [phase.least_s for phase in group if phase.least_s is not None]
+    return Phase(group[0].state, sum(phase.duration_s for phase in group), sum(least) if least else None)
+
+
+def _is_remnant(phase: Phase, before: Phase) -> bool:
+    """Whether a phase is too short for a stage, or short and gives no signal more than it had in the one before."""
+    had = {"G": "G", "g": GREEN}
+    more = any(letter in had and was not in had[letter] for letter, was in zip(phase.state, before.state, strict=False))
+    return phase.duration_s < SHORTEST_STAGE_S or (phase.duration_s < MIN_GREEN_S and not more)
+
+
+def own(tls: Any) -> Programme | None:
+    """The net's own programme of a signal (a sumolib TLS), if it has one."""
+    program = next(iter(tls.getPrograms().values()), None)
+    if program is None:
+        return None
+    phases = (
+        Phase(phase.state, float(phase.duration), float(phase.minDur) if phase.minDur >= 0 else None)
+        for phase in program.getPhases()
+    )
+    return Programme.of(phases, float(program.getOffset()))
+
+
+def added(files: Sequence[Path]) -> dict[str, Programme]:
+    """Signal programmes in additional files, by signal: the last one read stands, as in SUMO."""
+    from defusedxml import ElementTree  # noqa: PLC0415
+
+    found = {}
+    for file in files:
+        with opened(file) as content:
+            logics = [logic for logic in ElementTree.parse(content).iter("tlLogic") if logic.find("phase") is not None]
+        for logic in logics:
+            try:
+                shown = [_phase(element) for element in logic.iter("phase")]
+                found[logic.get("id")] = Programme.of(shown, float(logic.get("offset", "0")))
+            except ValueError as error:
+                raise NetworkError(
+                    f"additional file {str(file)!r}: the programme of {logic.get('id')!r} has times that are no numbers"
+                    f" ({error}): give seconds"
+                ) from error
+    return found
+
+
+def _phase(element: Any) -> Phase:
+    least = element.get("minDur")
+    return Phase(element.get("state", ""), float(element.get("duration", "")), None if least is None else float(least))
+
+
+def why_left_alone(programme: Programme | None, signals: int) -> str:
+    """Why a signal with so many letters in use can't be controlled; empty if it can."""
+    if programme is None:
+        return "it has no signal programme, as rail signals have none"
+    states = [phase.state for phase in programme.phases]
+    if any(letter in OFF for state in states for letter in state):
+        return "its programme switches signals off (o, O)"
+    stages = len(programme.opens)
+    if stages == 0:
+        return "no phase of its programme shows green without yellow"
+    if stages == 1:
+        return "its programme has one stage: there is nothing to share out"
+    if any(len(state) != len(states[0]) or len(state) < signals for state in states):
+        return f"its programme's states have not a letter for each of its {signals} signals"
+    return ""

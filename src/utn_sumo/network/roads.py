@@ -1,0 +1,115 @@
+"""How edges of a SUMO net make up links: chained upstream through nodes without signals, lanes by what uses them.
+
+A link is the main road to a stop line. It goes on upstream through a node without signals where the main road in and
+the main road out name each other; side roads at such a node bring traffic onto the link, or take it off, amid it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+MOTOR = ("passenger", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped")
+"""SUMO's vehicle classes that a lane for motor vehicles has one of, at least."""
+TURNAROUND = "t"
+STRAIGHT = "s"
+RARE_LANES = 0.05
+"""What a turnaround, or a turn for buses alone, counts as where nothing says how many take it."""
+
+
+def motor_lanes(edge: Any) -> tuple[int, ...]:
+    """Numbers of the lanes of a sumolib edge for motor vehicles."""
+    return tuple(lane.getIndex() for lane in edge.getLanes() if _admits_motors(lane))
+
+
+def _admits_motors(lane: Any) -> bool:
+    return any(lane.allows(vehicle) for vehicle in MOTOR)
+
+
+def for_motors(connections: Iterable[Any]) -> list[Any]:
+    """The connections between lanes for motor vehicles."""
+    return [each for each in connections if _admits_motors(each.getFromLane()) and _admits_motors(each.getToLane())]
+
+
+def usual_weight(connections: Iterable[Any]) -> float:
+    """How much of an edge's traffic takes the turn that these connections make up, by their lanes; relative."""
+    return sum(
+        1.0 if each.getDirection() != TURNAROUND and each.getFromLane().allows("passenger") else RARE_LANES
+        for each in connections
+    )
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The edges of a link, its stop line's last, and where traffic joins and parts amid it: lanes inside nodes."""
+
+    edges: tuple[str, ...]
+    joining: tuple[str, ...]
+    parting: tuple[str, ...]
+
+
+class Roads:
+    """Follows the main roads of a net (sumolib) upstream."""
+
+    def __init__(self, net: Any, approaches: Collection[str]):
+        """`approaches` are the edges that end at a signal's stop line."""
+        self._net = net
+        self._approaches = approaches
+
+    def chain(self, approach: str) -> Chain:
+        """The link that ends with the edge `approach`."""
+        edges, joining, parting = [approach], list[str](), list[str]()
+        while True:
+            edge = self._net.getEdge(edges[0])
+            before = self._main_before(edge)
+            if before is None or before.getID() in edges:
+                return Chain(tuple(edges), tuple(sorted(joining)), tuple(sorted(parting)))
+            onto = [c for other, each in edge.getIncoming().items() if other is not before for c in for_motors(each)]
+            off = [c for other, each in before.getOutgoing().items() if other is not edge for c in for_motors(each)]
+            joining += [each.getViaLaneID() for each in onto]
+            parting += [each.getViaLaneID() for each in off]
+            edges.insert(0, before.getID())
+
+    def _main_before(self, edge: Any) -> Any | None:
+        """The edge that the main road comes from, through a node without signals that can be watched; else None."""
+        incoming = {other: for_motors(each) for other, each in edge.getIncoming().items()}
+        if any(each.getTLSID() for connections in edge.getIncoming().values() for each in connections):
+            return None
+        before = _main(incoming)
+        if before is None or before.getID() in self._approaches:
+            return None
+        outgoing = {other: for_motors(each) for other, each in before.getOutgoing().items()}
+        sides = [each for other, connections in incoming.items() if other is not before for each in connections]
+        sides += [each for other, connections in outgoing.items() if other is not edge for each in connections]
+        return before if _main(outgoing) is edge and all(each.getViaLaneID() for each in sides) else None
+
+
+def _main(sides: Mapping[Any, list[Any]]) -> Any | None:
+    """The main one of the roads that meet another at a node: straight on, then by lanes, then by the road's rank."""
+    able = [(edge, connections) for edge, connections in sides.items() if usual_weight(connections) > RARE_LANES]
+    if not able:
+        return None
+
+    def rank(side: tuple[Any, list[Any]]) -> tuple[Any, ...]:
+        edge, connections = side
+        straight = any(each.getDirection() == STRAIGHT for each in connections)
+        return straight, usual_weight(connections), edge.getPriority(), edge.getID()
+
+    return max(able, key=rank)[0]
+
+
+def lane_groups(turns: Iterable[tuple[str, Iterable[int]]]) -> list[tuple[tuple[int, ...], tuple[str, ...]]]:
+    """Lanes that share turns, with those turns, from (turn, its lanes): in the order of the lanes."""
+    groups: list[tuple[set[int], set[str]]] = []
+    for turn, lanes in turns:
+        own, names = set(lanes), {turn}
+        apart = []
+        for other, others in groups:
+            if other & own:
+                own |= other
+                names |= others
+            else:
+                apart.append((other, others))
+        groups = [*apart, (own, names)]
+    return sorted((tuple(sorted(lanes)), tuple(sorted(names))) for lanes, names in groups)
