@@ -559,10 +559,10 @@ def test_every_step_starts_from_what_was_agreed_in_the_last_one_shifted_and_its_
     mpc = DistributedMPC(utn17, step_s=step_s, horizon=2)
     ask(mpc)
     region = mpc.crew.regions[0]
-    agreed = region.mean.copy(), region.price.copy()
+    agreed = region.target.copy(), region.price.copy()
     state, forecast = quiet_state(utn17), Forecast(np.zeros((2, 17)))
     assert region.begin(state, forecast) == {}
-    for before, after in zip(agreed, (region.mean, region.price), strict=True):
+    for before, after in zip(agreed, (region.target, region.price), strict=True):
         assert after[:, :-steps].tolist() == before[:, steps:].tolist()
         assert after[:, -steps:].tolist() == before[:, -steps:].tolist()
 
