@@ -168,7 +168,7 @@ class Region:
         return {} if mode == "none" else self._tell(self._total, {PRODUCER, CONSUMER})
 
     def agree(self, inbox: list[Message]) -> Floats:
-        """Hear the neighbours' answers, and find where `target` and `price` go from there; with `admm`, `mix` sets them.
+        """Hear the neighbours' answers, and find where they lead `target` and `price`, which `mix` sets with `admm`.
 
         This region's sums of squares (see `SUMS`) and, with `admm`, the residual's inner products (see `Memory.push`).
         """
