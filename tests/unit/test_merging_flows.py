@@ -10,6 +10,7 @@ import pytest
 
 from nets import one_way_grid
 from utn_controllers.mpc.batch import Batch
+from utn_controllers.mpc.central import CentralizedMPC
 from utn_controllers.mpc.distributed import DistributedMPC
 from utn_controllers.mpc.place import places
 from utn_controllers.mpc.problem import JunctionProblem
@@ -137,3 +138,27 @@ def test_there_is_a_plan_for_every_hard_case(merging: Network, coordination: str
         plan = mpc.plan(*HARD[case](merging, np.random.default_rng(seed), HORIZON))
         for green_s in all_greens(plan):
             signals.admit(Plan(green_s), merging)
+
+
+def test_a_junction_that_feeds_its_own_link_tells_nobody(utn17: Network) -> None:
+    alone = utn17.part(4)
+    # Its exit leads round onto the second of its links, which then is no source.
+    lone = rerouted(alone, {int(np.flatnonzero(alone.turn_next == EXIT)[0]): 1})
+    lone = replace(lone, links=(replace(lone.links[0], is_source=True), lone.links[1]))
+    mpc = DistributedMPC(lone)
+    plan = mpc.plan(*some(lone, 1))
+    assert plan.facts["bytes_exchanged"] == 0
+    assert plan.facts["iterations"] > 1
+    assert -1e-6 <= gap(lone, mpc, *some(lone, 2)) <= 1e-3
+
+
+@pytest.mark.parametrize("controller", [DistributedMPC, CentralizedMPC])
+def test_a_network_that_nobody_leaves_is_planned_too(utn17: Network, controller: Any) -> None:
+    fed = np.flatnonzero(~utn17.is_source)
+    exits = np.flatnonzero(utn17.turn_next == EXIT)
+    closed = rerouted(utn17, dict(zip(exits.tolist(), np.resize(fed, len(exits)).tolist(), strict=True)))
+    mpc = controller(closed)
+    for case in HARD.values():
+        plan = mpc.plan(*case(closed, np.random.default_rng(1), HORIZON))
+        for green_s in all_greens(plan):
+            signals.admit(Plan(green_s), closed)

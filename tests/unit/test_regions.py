@@ -10,8 +10,9 @@ import pytest
 
 from utn_controllers.mpc.crew import Processes
 from utn_controllers.mpc.distributed import DistributedMPC
+from utn_controllers.mpc.interactions import Message
 from utn_controllers.mpc.place import places
-from utn_controllers.mpc.region import SUMS, Message, Region
+from utn_controllers.mpc.region import SUMS, Region
 from utn_controllers.mpc.settings import Settings
 from utn_sumo.contract import EXIT, Forecast, Network, State
 from utn_sumo.errors import ControllerError

@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import spsolve
 
 from utn_sumo.contract import EXIT, Floats, Ints, Network
 
+MOST_LINKS = 1000
+"""Of a way through the network: where nobody ever leaves it, as in a net without exits, it would have no end."""
 PRODUCER, CONSUMER = 0, 1
 """What a junction is to a link: it feeds it, or has it for one of its own."""
 
@@ -86,5 +87,8 @@ def remaining_steps(network: Network) -> Floats:
     own = (network.free_time_s + network.cycle_s[network.link_junction] / 2) / network.control_step_s
     fed = np.flatnonzero(network.turn_next != EXIT)
     size = len(network.links)
-    onward = sp.csc_array((network.fraction[fed], (network.turn_link[fed], network.turn_next[fed])), shape=(size, size))
-    return np.asarray(spsolve(sp.csc_array(sp.eye_array(size)) - onward, own), dtype=float)
+    onward = sp.csr_array((network.fraction[fed], (network.turn_link[fed], network.turn_next[fed])), shape=(size, size))
+    remaining = own
+    for _ in range(MOST_LINKS):
+        remaining = own + onward @ remaining
+    return np.asarray(remaining, dtype=float)

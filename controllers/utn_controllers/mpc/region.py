@@ -8,7 +8,6 @@ add to these sums travels as messages.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from utn_controllers.mpc.acceleration import Memory
 from utn_controllers.mpc.agent import NOWHERE, Agent
+from utn_controllers.mpc.interactions import Interactions, Message
 from utn_controllers.mpc.place import CONSUMER, PRODUCER, Place, Side
 from utn_controllers.mpc.receding import RecedingProblem
 from utn_controllers.mpc.settings import Settings
@@ -30,19 +30,6 @@ DAMPING = 0.5
 """Of `sensitivity`: the share of its neighbours' last word that an agent takes over. Undamped it oscillates."""
 
 
-@dataclass(frozen=True)
-class Message:
-    """What one region tells another: a row for each kind of side that it has at a link with sides in both."""
-
-    links: Ints
-    """(n,)"""
-    kinds: Ints
-    """(n,) PRODUCER or CONSUMER."""
-    numbers: Floats
-    """(n, model steps) sums over the sender's sides of this kind: of their flows [veh], or the price of what comes in;
-    at first both, side by side."""
-
-
 class Region:
     """Agents with their sides of what is agreed: `target` [veh] and `price`, (sides, model steps) each."""
 
@@ -54,24 +41,6 @@ class Region:
         self.settings = settings
         self.rho = settings.first_rho if settings.coordination != "none" else 0.0
         own = [place.sides for place in places]
-        sides = [side for each in own for side in each]
-        self.links = np.array(sorted({side.link for side in sides}), dtype=np.int64)
-        """(n,) the interactions: links with a side here."""
-        self._kind = np.array([side.kind for side in sides], dtype=np.int64)
-        self._row = np.searchsorted(self.links, np.array([side.link for side in sides], dtype=np.int64))
-        """(sides,) the interaction of each."""
-        self._sign = np.where(self._kind == PRODUCER, 1.0, -1.0)[:, None]
-        self._held = np.zeros((2, len(self.links)), dtype=np.bool_)
-        """Whether any side of a kind is here."""
-        self._held[self._kind, self._row] = True
-        elsewhere = np.array([len(partners.get(link, ())) for link in self.links.tolist()], dtype=np.int64)
-        self._count = (np.bincount(self._row, minlength=len(self.links)) + elsewhere)[:, None]
-        """(n, 1) sides of each interaction, here and elsewhere; one of them is its consumer's."""
-        self._across = {
-            region: np.flatnonzero([region in partners.get(link, ()) for link in self.links.tolist()])
-            for region in sorted({region for regions in partners.values() for region in regions})
-        }
-        """Rows that each neighbouring region has sides of too."""
         starts = np.cumsum([0, *map(len, own)]).tolist()
         self.agents = [
             _agent(place, {side: start + index for index, side in enumerate(each)}, settings)
@@ -88,12 +57,11 @@ class Region:
         """Where each agent's variables are among all."""
         self._shared = np.concatenate([agent.shared for agent in self.agents])
         # What is part of no side goes to a number past the last.
-        self._shared[self._shared == NOWHERE] = len(sides) * steps
-        self._flow = np.zeros((len(sides), steps))
-        self._total = np.zeros((2, len(self.links), steps))
+        self._shared[self._shared == NOWHERE] = starts[-1] * steps
+        self.interactions = Interactions(own, partners, steps)
+        self._flow = np.zeros((starts[-1], steps))
+        self._total = self.interactions.total(self._flow)
         """Of the flows of an interaction's producers and of its consumer's, here and, once heard of, elsewhere."""
-        self._summand = ((self._kind * len(self.links) + self._row)[:, None] * steps + np.arange(steps)).ravel()
-        """Where in the totals each number of a flow belongs."""
         self.target: Floats = np.zeros_like(self._flow)
         self.price: Floats = np.zeros_like(self._flow)
         self._memory = Memory(2 * self.target.size)
@@ -115,76 +83,76 @@ class Region:
                 array[:, :-shift] = array[:, shift:].copy()
             return {}
         expected = self._expected(states)
-        self._suppose(self._held[CONSUMER], expected)
-        if not self._fresh:
+        self._suppose(self.interactions.held[CONSUMER], *expected)
+        if not self._fresh or mode == "none":
             return {}
         self._fresh = False
-        return self._tell(np.array([expected, expected]), {CONSUMER})
+        both = np.concatenate(expected, axis=1)
+        return self.interactions.tell(np.array([both, both]), CONSUMER)
 
-    def _expected(self, states: list[State]) -> Floats:
-        """(n, 2 model steps) that comes in what came of late, and at what price: what a vehicle more is likely to cost.
+    def _expected(self, states: list[State]) -> tuple[Floats, Floats]:
+        """(n, model steps) what comes in on its own agents' links and its price.
 
-        Of the links of its own agents.
+        What came of late, and what a vehicle more is likely to cost.
         """
-        flow, price = np.zeros((2, *self._total.shape[1:]))
+        flow, price = np.zeros_like(self._total)
         for agent, own in zip(self.agents, states, strict=True):
             place = agent.place
             fed = ~place.part.is_source
-            rows = np.searchsorted(self.links, place.links[fed])
+            rows = np.searchsorted(self.interactions.links, place.links[fed])
             rate = own.past_inflow_veh.mean(axis=0)[fed] / place.part.sample_s
             flow[rows] = rate[:, None] * agent.problem.model.step_s
             if self.settings.coordination != "none":
                 price[rows] = self.settings.price(place.remaining_steps[fed])[:, None]
-        return np.concatenate([flow, price], axis=1)
+        return flow, price
 
-    def _suppose(self, known: Bools, expected: Floats) -> None:
-        """Start from what is expected (n, 2 model steps) of the interactions `known` (n,): as much of each producer."""
-        here = known[self._row]
-        flow, price = np.split(expected[self._row[here]], 2, axis=1)
-        producers = self._count[self._row[here]] - 1
-        self.target[here] = np.where(self._sign[here] > 0, flow / np.maximum(producers, 1), flow)
-        self.price[here] = price
+    def _suppose(self, known: Bools, flow: Floats, price: Floats) -> None:
+        """Start from a flow and a price (n, model steps) of the interactions that are `known` (n,)."""
+        row = self.interactions.row
+        here = known[row]
+        self.target[here] = self.interactions.first(flow)[here]
+        self.price[here] = price[row][here]
 
     def greet(self, inbox: list[Message]) -> None:
         """Take over what the neighbours expect to come in, and its price: all sides then start from the same."""
         for message in inbox:
-            rows = np.searchsorted(self.links, message.links)
-            expected = np.zeros((len(self.links), message.numbers.shape[1]))
-            expected[rows] = message.numbers
-            self._suppose(np.isin(self.links, message.links), expected)
+            rows = self.interactions.rows(message)
+            expected = np.zeros_like(self._total)
+            expected[:, rows] = np.split(message.numbers, 2, axis=1)
+            self._suppose(np.isin(self.interactions.links, message.links), *expected)
 
     def solve(self) -> dict[int, Message]:
         """Every agent's best answer to what is agreed so far; the messages that tell the neighbours."""
         mode = self.settings.coordination
-        linear = self._sign * self.price - self.rho * self.target
+        sign = self.interactions.sign
+        linear = sign * self.price - self.rho * self.target
         if mode != "admm":
-            linear = np.where(self._sign > 0, linear, self.target)
+            linear = np.where(sign > 0, linear, self.target)
         terms = np.append(linear, 0.0)[self._shared]
         answers = [agent.solve(terms[start:end]) for agent, (start, end) in zip(self.agents, self._parts, strict=True)]
         flow = np.bincount(self._shared, np.concatenate(answers), minlength=self._flow.size + 1)[:-1]
         self._flow = flow.astype(float).reshape(self._flow.shape)
-        total = np.bincount(self._summand, flow, minlength=self._total.size)
-        self._total = total.astype(float).reshape(self._total.shape)
-        return {} if mode == "none" else self._tell(self._total, {PRODUCER, CONSUMER})
+        self._total = self.interactions.total(self._flow)
+        return {} if mode == "none" else self.interactions.tell(self._total, PRODUCER, CONSUMER)
 
     def agree(self, inbox: list[Message]) -> Floats:
         """Hear the neighbours' answers, and find where they lead `target` and `price`, which `mix` sets with `admm`.
 
         This region's sums of squares (see `SUMS`) and, with `admm`, the residual's inner products (see `Memory.push`).
         """
-        for message in inbox:
-            self._total[message.kinds, np.searchsorted(self.links, message.links)] += message.numbers
+        self.interactions.hear(self._total, inbox)
         flow, (produced, consumed) = self._flow, self._total
+        row, sign = self.interactions.row, self.interactions.sign
         if self.settings.coordination == "admm":
             # Boyd et al. 2011, 7.3.2 and 3.4.3: every side goes the same way towards a sum of none, over-relaxed.
-            beyond = self.settings.relaxation * ((produced - consumed) / self._count)[self._row]
-            target = self.target + self.settings.relaxation * (flow - self.target) - self._sign * beyond
+            beyond = self.settings.relaxation * ((produced - consumed) / self.interactions.count)[row]
+            target = self.target + self.settings.relaxation * (flow - self.target) - sign * beyond
             price = self.price + self.rho * beyond
-            own, apart, moved = np.ones_like(self._sign), flow - target, self.rho * (target - self.target)
+            own, apart, moved = np.ones_like(sign), flow - target, self.rho * (target - self.target)
         else:
-            own = np.maximum(self._sign, 0.0)
-            wanted = np.where(own > 0, flow, produced[self._row])
-            apart, moved = wanted - self.target, consumed[self._row] - self.price
+            own = np.maximum(sign, 0.0)
+            wanted = np.where(own > 0, flow, produced[row])
+            apart, moved = wanted - self.target, consumed[row] - self.price
             target, price = self.target + DAMPING * apart, self.price + DAMPING * moved
         sums = [_squares(own, each) for each in (apart, flow)]
         sums += [_squares(np.ones_like(own), each) for each in (moved, target, price)]
@@ -214,20 +182,9 @@ class Region:
         """(Kc, S) greens as they are now, an agent's after the other's."""
         return np.concatenate([agent.settle() for agent in self.agents], axis=1)
 
-    def size(self) -> int:
-        """Numbers that its agents share: their sides, times the model steps."""
-        return self._flow.size
-
-    def _tell(self, numbers: Floats, kinds: set[int]) -> dict[int, Message]:
-        """Messages with `numbers` (2, n, any) of what is here of the interactions that cross its border."""
-        told = {}
-        for region, rows in self._across.items():
-            kind, row = np.nonzero(self._held[:, rows])
-            kept = np.isin(kind, list(kinds))
-            if kept.any():
-                kind, row = kind[kept], rows[row[kept]]
-                told[region] = Message(self.links[row], kind, numbers[kind, row])
-        return told
+    def size(self) -> tuple[int, int]:
+        """Numbers that its agents share: their sides, times the model steps; of these, those told to other agents."""
+        return self._flow.size, self.interactions.told
 
 
 def _agent(place: Place, number: dict[Side, int], settings: Settings) -> Agent | Batch:

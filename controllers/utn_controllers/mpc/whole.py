@@ -25,6 +25,8 @@ WIDER = (0.0, 1e-7, 1e-6)
 On a road without vehicles no flow has room between its bounds; an interior point method then has nowhere to stand,
 and its multipliers no end. A bound that gives way by so little changes the cost by as little times its multiplier.
 """
+OUTWARD = {"h_l": -1, "h_u": 1, "x_l": -1, "x_u": 1}
+"""Which way each of the bounds is made wider."""
 MOST_ITERATIONS = 100
 """Several times what a problem with an interior takes."""
 
@@ -109,11 +111,7 @@ class WholeProblem:
         numbers = self.numbers(programs, greens)
         self.iterations = 0
         for wider in WIDER:
-            self._load(
-                numbers
-                | {side: numbers[side] - wider for side in ("h_l", "x_l")}
-                | {side: numbers[side] + wider for side in ("h_u", "x_u")}
-            )
+            self._load(numbers | {side: numbers[side] + sign * wider for side, sign in OUTWARD.items()})
             status = self._solver.solve()
             result = self._solver.result
             self.iterations += int(result.info.iter)
