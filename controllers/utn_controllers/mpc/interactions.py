@@ -61,7 +61,8 @@ class Interactions:
 
     def total(self, flow: Floats) -> Floats:
         """(2, n, model steps) what all producers here send and what the consumer takes; `flow` (sides, model steps)."""
-        return np.bincount(self._summand, flow.ravel(), minlength=int(np.prod(self._shape))).reshape(self._shape)
+        summed = np.bincount(self._summand, flow.ravel(), minlength=int(np.prod(self._shape)))
+        return np.asarray(summed, dtype=float).reshape(self._shape)
 
     def hear(self, total: Floats, inbox: Sequence[Message]) -> None:
         """Add to such a total (2, n, model steps) what others have."""
