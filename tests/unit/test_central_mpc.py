@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import daqp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import settings as limits
+from hypothesis import strategies as st
 
 from utn_controllers.mpc.central import CentralizedMPC, Convex
 from utn_controllers.mpc.distributed import DistributedMPC
-from utn_controllers.mpc.problem import Timing
+from utn_controllers.mpc.problem import QuadraticProgram, Timing
 from utn_controllers.mpc.receding import RecedingProblem
 from utn_controllers.mpc.statement import STORAGE_PENALTY
-from utn_controllers.mpc.whole import optimum, programs
+from utn_controllers.mpc.whole import WIDER, WholeProblem, optimum, programs
 from utn_sumo import signals
-from utn_sumo.contract import Floats, Network, Plan
+from utn_sumo.contract import Floats, Forecast, Network, Plan, State
 from utn_sumo.controllers import build
-from utn_sumo.errors import SettingError
-from utn_sumo.testing import HARD, random_forecast, random_state
+from utn_sumo.errors import ControllerError, SettingError
+from utn_sumo.testing import HARD, levels, random_forecast, random_split, random_state
 
 HORIZON = 7
 
@@ -86,6 +91,97 @@ def test_there_is_a_plan_for_every_hard_case(net: Network, cost: str, case: str)
     mpc = CentralizedMPC(net, cost=cost)
     for seed in range(3):
         signals.admit(mpc.plan(*HARD[case](net, np.random.default_rng(seed), HORIZON)), net)
+
+
+def almost_empty(net: Network, rng: np.random.Generator) -> tuple[State, Forecast]:
+    """Few links with anybody on them, and of these some with a trace of a vehicle only, as an estimator leaves it."""
+    empty, forecast = HARD["empty"](net, rng, HORIZON)
+    links = len(net.links)
+    x = 10.0 ** rng.uniform(-9, 0.5, links) * (rng.random(links) < rng.random())
+    queue = x * levels(rng, links)
+    past = np.zeros_like(empty.past_inflow_veh)
+    past[rng.integers(len(past)), :] = (x - queue) * levels(rng, links)
+    share = random_split(net, rng)
+    share[rng.random(len(share)) < 0.2] = 0.0
+    total = np.bincount(net.turn_link, share, links)
+    share = np.where(total[net.turn_link] > 0, share / np.maximum(total[net.turn_link], 1e-9), net.fraction)
+    demand = net.is_source * 10.0 ** rng.uniform(-9, 0.5, (HORIZON, links)) * (rng.random((HORIZON, links)) < 0.2)
+    state = replace(empty, x_veh=x, q_veh=share * queue[net.turn_link], past_inflow_veh=past, fraction=share)
+    return state, replace(forecast, demand_veh=demand)
+
+
+@pytest.fixture(scope="module")
+def stubby(utn17: Network) -> Network:
+    """utn17 with some links of a metre and less, which hold a fraction of a vehicle."""
+    length_m = {"2": 1.0, "5": 0.2, "10": 0.1, "14": 3.0}
+    shorter = [
+        replace(link, length_m=length_m[link.id], storage_veh=2 * length_m[link.id] / 7.5)
+        if link.id in length_m
+        else link
+        for link in utn17.links
+    ]
+    return replace(utn17, name="stubby", links=tuple(shorter))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@limits(max_examples=60)
+def test_almost_nobody_on_the_road_is_planned_for_too(net: Network, cost: str, seed: int) -> None:
+    mpc = MPCS.setdefault((net.name, cost), CentralizedMPC(net, cost=cost, tolerance=1e-9))
+    for green_s in all_greens(mpc.plan(*almost_empty(net, np.random.default_rng(seed)))):
+        signals.admit(Plan(green_s), net)
+
+
+MPCS: dict[tuple[str, str], CentralizedMPC] = {}
+
+
+def by_active_sets(whole: WholeProblem, stated: Sequence[QuadraticProgram]) -> float:
+    """Least cost by another solver, which needs no interior."""
+    numbers = whole.numbers(stated)
+    rows = np.vstack([whole.equal.toarray(), numbers["G"].toarray()])
+    upper, lower = (np.concatenate([numbers[x], numbers["b"], numbers[h]]) for x, h in (("x_u", "h_u"), ("x_l", "h_l")))
+    sense = np.zeros(len(upper), dtype=np.int32)
+    sense[upper == lower] = 5
+    _, least, flag, _ = daqp.solve(whole.hessian.toarray(), numbers["c"], rows, upper, lower, sense)
+    assert flag in (1, 2)
+    return float(least + sum(program.constant for program in stated))
+
+
+@pytest.mark.parametrize("case", ["almost empty", *HARD])
+def test_another_solver_finds_the_same_least_cost(stubby: Network, cost: str, case: str) -> None:
+    convex = planner(CentralizedMPC(stubby, cost=cost))
+    problems = [each.problem for each in convex.receding]
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        met = almost_empty(stubby, rng) if case == "almost empty" else HARD[case](stubby, rng, HORIZON)
+        stated = programs(problems, *met, joined(convex.receding))
+        # In turn, so that each is solved after others; what the widest bounds may save is the most of WIDER.
+        found, _ = convex.whole.solve(stated)
+        assert found == pytest.approx(by_active_sets(convex.whole, stated), rel=1e-5, abs=3e3 * WIDER[-1])
+
+
+def test_it_stays_as_sure_after_many_plans_as_in_the_first(stubby: Network, cost: str) -> None:
+    old = CentralizedMPC(stubby, cost=cost)
+    rng = np.random.default_rng(5)
+    for _ in range(30):
+        old.plan(random_state(stubby, rng), random_forecast(stubby, rng, HORIZON))
+    new, last = planner(CentralizedMPC(stubby, cost=cost)), planner(old)
+    state, forecast = random_state(stubby, rng), random_forecast(stubby, rng, HORIZON)
+    stated = programs([each.problem for each in last.receding], state, forecast, joined(last.receding))
+    assert last.whole.solve(stated)[0] == new.whole.solve(stated)[0]
+    assert last.whole.iterations == new.whole.iterations
+
+
+def test_a_problem_without_a_solution_is_told(utn17: Network) -> None:
+    rng = np.random.default_rng(1)
+    convex = planner(CentralizedMPC(utn17))
+    problems = [each.problem for each in convex.receding]
+    stated = programs(problems, *HARD["ordinary"](utn17, rng, HORIZON), joined(convex.receding))
+    upper = stated[0].upper.copy()
+    upper[problems[0].layout.leaving[0]] = -1.0
+    with pytest.raises(ControllerError, match="no optimum"):
+        convex.whole.solve([replace(stated[0], upper=upper), *stated[1:]])
+    # And the next is solved as if nothing had been.
+    assert convex.whole.solve(stated)[0] == planner(CentralizedMPC(utn17)).whole.solve(stated)[0]
 
 
 def test_without_its_constraints_it_promises_more_and_its_greens_fit_no_cycle(utn17: Network, cost: str) -> None:

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
 
+from utn_controllers.mpc.agent import Agent
 from utn_controllers.mpc.distributed import DistributedMPC, Settings
 from utn_controllers.mpc.place import places, remaining_steps
 from utn_controllers.mpc.problem import JunctionProblem, QuadraticProgram, Timing
@@ -559,10 +560,10 @@ def test_every_step_starts_from_what_was_agreed_in_the_last_one_shifted_and_its_
     mpc = DistributedMPC(utn17, step_s=step_s, horizon=2)
     ask(mpc)
     region = mpc.crew.regions[0]
-    agreed = region.mean.copy(), region.price.copy()
+    agreed = region.target.copy(), region.price.copy()
     state, forecast = quiet_state(utn17), Forecast(np.zeros((2, 17)))
     assert region.begin(state, forecast) == {}
-    for before, after in zip(agreed, (region.mean, region.price), strict=True):
+    for before, after in zip(agreed, (region.target, region.price), strict=True):
         assert after[:, :-steps].tolist() == before[:, steps:].tolist()
         assert after[:, -steps:].tolist() == before[:, -steps:].tolist()
 
@@ -612,9 +613,12 @@ class Solver:
     bad_solves = 0
     bad_flag = -1
     spoilt = False
+    lasts = 10**9
+    """Solves after which it answers no numbers any more."""
 
     def __init__(self) -> None:
         self.real = REAL()
+        self.solves = 0
 
     def setup(self, *arguments: Any) -> Any:
         answer = self.real.setup(*arguments)
@@ -625,7 +629,8 @@ class Solver:
 
     def solve(self) -> Any:
         solution, value, flag, info = self.real.solve()
-        if Solver.spoilt:
+        self.solves += 1
+        if Solver.spoilt or self.solves > Solver.lasts:
             return np.full_like(solution, np.nan), value, flag, info
         if Solver.bad_solves > 0:
             Solver.bad_solves -= 1
@@ -639,7 +644,7 @@ REAL = daqp.Model
 @pytest.fixture
 def solver(monkeypatch: pytest.MonkeyPatch) -> type[Solver]:
     monkeypatch.setattr(daqp, "Model", Solver)
-    for name, value in {"setup_flag": None, "bad_solves": 0, "bad_flag": -1, "spoilt": False}.items():
+    for name, value in {"setup_flag": None, "bad_solves": 0, "bad_flag": -1, "spoilt": False, "lasts": 10**9}.items():
         monkeypatch.setattr(Solver, name, value)
     return Solver
 
@@ -673,6 +678,24 @@ def test_one_failed_solve_is_tried_again_cold(utn17: Network, solver: type[Solve
     solver.bad_solves = 1
     assert ask(DistributedMPC(utn17)).green_s == pytest.approx(expected, abs=1e-6)
     assert solver.bad_solves == 0
+
+
+def test_a_solver_that_has_lost_its_numbers_is_set_up_anew(utn17: Network, solver: type[Solver]) -> None:
+    expected = ask(DistributedMPC(utn17)).green_s
+    solver.lasts = 5
+    assert ask(DistributedMPC(utn17)).green_s == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("share", [-1e-6, -1e-7])
+def test_a_given_inflow_a_tolerance_under_none_is_none(utn17: Network, share: float) -> None:
+    agent = DistributedMPC(utn17, coordination="sensitivity").agents[4]
+    assert isinstance(agent, Agent)
+    empty, forecast = HARD["empty"](utn17, np.random.default_rng(1), HORIZON)
+    agent.prepare(empty.part(agent.place.links, agent.place.turns), forecast.part(agent.place.links), 0.2)
+    given = np.zeros(agent.problem.layout.size)
+    expected = agent.solve(given)
+    given[agent.problem.layout.inflow] = share
+    assert agent.solve(given) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_controller_that_failed_plans_again_in_the_next_step(utn17: Network, solver: type[Solver]) -> None:

@@ -10,8 +10,9 @@ import pytest
 
 from utn_controllers.mpc.crew import Processes
 from utn_controllers.mpc.distributed import DistributedMPC
+from utn_controllers.mpc.interactions import Message
 from utn_controllers.mpc.place import places
-from utn_controllers.mpc.region import SUMS, Message, Region
+from utn_controllers.mpc.region import SUMS, Region
 from utn_controllers.mpc.settings import Settings
 from utn_sumo.contract import EXIT, Forecast, Network, State
 from utn_sumo.errors import ControllerError
@@ -46,15 +47,13 @@ def hops(net: Network, start: int) -> dict[int, int]:
 def lone_regions(net: Network, settings: Settings) -> list[Region]:
     """One region a junction."""
     found = places(net)
-    consumer = {link: junction for junction, place in enumerate(found) for link in place.consumed}
-    producer = {link: junction for junction, place in enumerate(found) for link in place.produced}
+    at: dict[int, list[int]] = {}
+    for junction, place in enumerate(found):
+        for side in place.sides:
+            at.setdefault(side.link, []).append(junction)
     return [
-        Region(
-            [place],
-            {link: producer[link] for link in place.consumed} | {link: consumer[link] for link in place.produced},
-            settings,
-        )
-        for place in found
+        Region([place], {link: [j for j in at[link] if j != own] for link in at if own in at[link]}, settings)
+        for own, place in enumerate(found)
     ]
 
 

@@ -3,6 +3,7 @@
 settings      what a user may set
 problem       one junction's problem, stated in CasADi; the whole is these side by side
 agent         one agent: its solver, and the copies that it shares
+interactions  who shares the flow onto which link
 coordination  how the agents come to terms
 whole         everything solved at once
 distributed   the controller `dmpc`

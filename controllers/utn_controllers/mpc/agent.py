@@ -15,6 +15,9 @@ EQUALITY = 5
 """DAQP's code for an equality row."""
 OPTIMAL = (1, 2)
 """DAQP's exit flags of an optimum: 1, and 2 with a soft constraint in use."""
+PATIENCE = 1000
+"""Steps without progress until DAQP says that it goes round in circles. Where nobody is on the road many rows meet in
+one point, and its own 10 are too few."""
 NOWHERE = -1
 """Of a variable that is no part of any shared flow."""
 
@@ -75,6 +78,7 @@ class Agent:
         sense[self._given] = EQUALITY
         self._rho = rho
         self._solver = self._new_solver()
+        self._solver.settings = {"cycle_tol": PATIENCE}
         flag, _ = self._solver.setup(
             program.hessian + rho * self._gram, program.gradient, program.matrix, program.upper, program.lower, sense
         )
@@ -98,23 +102,21 @@ class Agent:
         if len(given):
             gradient[given] = program.gradient[given]
             upper, lower = program.upper.copy(), program.lower.copy()
-            upper[given] = lower[given] = linear[given]
+            # A solver's tolerance under none, as neighbours may send it, is more than some rows can bear.
+            upper[given] = lower[given] = np.maximum(linear[given], 0.0)
             bounds = {"bupper": upper, "blower": lower}
-        self._solver.update(f=gradient, **bounds)
-        solution, _, flag, info = self._solver.solve()
-        if flag not in OPTIMAL:
-            # The active set of another state can lead the solver astray: once more, cold.
-            self.factorise(self._rho)
+        for cold in (False, True):
+            if cold:
+                # The active set of another state can lead the solver astray, and what is no number stays none.
+                self.factorise(self._rho)
             self._solver.update(f=gradient, **bounds)
             solution, _, flag, info = self._solver.solve()
-        if flag not in OPTIMAL or not np.isfinite(solution).all():
-            raise ControllerError(f"agent {self.place.part.name}: no optimum (flag {flag})")
-        self.solution = solution
-        if not len(given):
-            return np.asarray(solution)
-        answer = solution.copy()
-        answer[given] = -info["lam"][given]
-        return np.asarray(answer)
+            answer = solution.copy()
+            answer[given] = -info["lam"][given]
+            if flag in OPTIMAL and np.isfinite(solution).all() and np.isfinite(answer).all():
+                self.solution = solution
+                return np.asarray(answer)
+        raise ControllerError(f"agent {self.place.part.name}: no optimum (flag {flag})")
 
     def settle(self) -> Floats:
         """(Kc, S) greens of the last solution, from which the next step's problem starts."""

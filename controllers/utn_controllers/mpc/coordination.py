@@ -1,7 +1,8 @@
 """How the agents come to terms (SPEC 4): rounds of solving, telling the neighbours, and agreeing, until it is enough.
 
-`admm`         consensus on the flow between every producer and its consumer: Boyd et al. 2011, sections 3.4.1
-               (varying penalty), 3.4.3 (over-relaxation) and 3.3.1 (stopping)
+`admm`         exchange between the producers of a link and its consumer, which with one producer is consensus on the
+               flow between them: Boyd et al. 2011, sections 7.3.2, 3.4.1 (varying penalty), 3.4.3 (over-relaxation)
+               and 3.3.1 (stopping)
 `sensitivity`  the paper's mu: a producer is told what a vehicle more would cost its consumer, who takes what comes;
                damped, with a proximal term
 `none`         every agent for itself, with the inflow that it has seen of late
@@ -17,7 +18,8 @@ import numpy as np
 
 from utn_controllers.mpc.acceleration import Mixer
 from utn_controllers.mpc.crew import Crew
-from utn_controllers.mpc.region import SUMS, Message
+from utn_controllers.mpc.interactions import Message
+from utn_controllers.mpc.region import SUMS
 from utn_controllers.mpc.settings import Settings
 from utn_sumo.contract import Floats, Forecast, State
 
@@ -46,7 +48,7 @@ class Coordinator:
         self.settings = settings
         self._frozen = settings.coordination != "admm"
         self._rho = settings.first_rho
-        self._numbers = sum(crew.call("size"))
+        self._numbers, self._told = (sum(each) for each in zip(*crew.call("size"), strict=True))
 
     def plan(self, states: list[State], forecasts: list[Forecast]) -> tuple[list[Floats], Outcome]:
         """Greens (Kc, S) by region, and how they were come by, from what concerns each region.
@@ -63,11 +65,11 @@ class Coordinator:
         for iteration in range(1, iterations + 1):  # noqa: B007 - used after the loop
             inboxes = self._deliver(crew.call("solve"))
             sums = sum(crew.call("agree", inboxes))
-            apart, flow, moved, mean, price = np.sqrt(sums[: len(SUMS)])
+            apart, flow, moved, target, price = np.sqrt(sums[: len(SUMS)])
             primal, dual = float(apart), float(moved)
             scale = np.sqrt(self._numbers) * settings.tolerance_abs
             converged = bool(
-                primal <= scale + settings.tolerance_rel * max(flow, mean)
+                primal <= scale + settings.tolerance_rel * max(flow, target)
                 and dual <= scale * self._rho + settings.tolerance_rel * price
             )
             if settings.coordination == "admm":
@@ -76,7 +78,7 @@ class Coordinator:
                 break
             if not self._frozen and self._adapt(primal, dual):
                 mixer = Mixer()
-        exchanged = 0 if settings.coordination == "none" else iteration * self._numbers * BYTES_PER_NUMBER
+        exchanged = 0 if settings.coordination == "none" else iteration * self._told * BYTES_PER_NUMBER
         return crew.call("finish"), Outcome(iteration, primal, dual, converged, exchanged)
 
     def _deliver(self, outboxes: list[dict[int, Message]]) -> list[list[Message]]:

@@ -84,19 +84,18 @@ class DistributedMPC:
         return Plan(greens[0], greens[1:], facts=vars(outcome))
 
     def _crew(self) -> Crew:
-        """Neighbouring junctions in one region as far as their order tells; who feeds whom across the borders."""
-        ends: dict[int, list[int]] = {}
+        """Neighbouring junctions in one region as far as their order tells; whose links cross the borders."""
+        sides: dict[int, list[int]] = {}
         for region, group in enumerate(self._groups):
             for place in group:
-                for link in (*place.consumed, *place.produced):
-                    ends.setdefault(link, []).append(region)
+                for side in place.sides:
+                    sides.setdefault(side.link, []).append(region)
         builders = []
         for region, group in enumerate(self._groups):
             partners = {
-                link: next(other for other in ends[link] if other != region)
-                for place in group
-                for link in (*place.consumed, *place.produced)
-                if any(other != region for other in ends[link])
+                link: [other for other in regions if other != region]
+                for link, regions in sides.items()
+                if region in regions and set(regions) != {region}
             }
             builders.append(partial(Region, group, partners, self.settings))
         if self.settings.agents == "dask":

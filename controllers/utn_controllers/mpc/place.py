@@ -4,12 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import spsolve
 
 from utn_sumo.contract import EXIT, Floats, Ints, Network
+
+MOST_LINKS = 1000
+"""Of a way through the network: where nobody ever leaves it, as in a net without exits, it would have no end."""
+PRODUCER, CONSUMER = 0, 1
+"""What a junction is to a link: it feeds it, or has it for one of its own."""
+
+
+class Side(NamedTuple):
+    """A junction's part in the flow onto a link: one link has one consumer, and producers one or more."""
+
+    junction: int
+    """Among those of its place."""
+    kind: int
+    """PRODUCER or CONSUMER; a junction that feeds its own link is both."""
+    link: int
 
 
 @dataclass(frozen=True)
@@ -31,13 +46,19 @@ class Place:
 
     @property
     def consumed(self) -> list[int]:
-        """Links of this junction that a neighbour feeds."""
+        """Links of this junction that any junction feeds."""
         return [int(link) for link in self.links[~self.part.is_source]]
 
     @property
-    def produced(self) -> list[int]:
-        """Links that this junction feeds."""
-        return sorted(set(self.turn_next[self.turn_next != EXIT].tolist()))
+    def sides(self) -> list[Side]:
+        """What its junctions share with each other and with the rest of the network."""
+        part = self.part
+        at = part.link_junction
+        consumed = [Side(int(at[own]), CONSUMER, int(self.links[own])) for own in np.flatnonzero(~part.is_source)]
+        feeding = np.flatnonzero(self.turn_next != EXIT)
+        return consumed + sorted(
+            {Side(int(at[part.turn_link[turn]]), PRODUCER, int(self.turn_next[turn])) for turn in feeding}
+        )
 
 
 def places(network: Network, groups: Iterable[Sequence[int]] | None = None) -> list[Place]:
@@ -66,5 +87,8 @@ def remaining_steps(network: Network) -> Floats:
     own = (network.free_time_s + network.cycle_s[network.link_junction] / 2) / network.control_step_s
     fed = np.flatnonzero(network.turn_next != EXIT)
     size = len(network.links)
-    onward = sp.csc_array((network.fraction[fed], (network.turn_link[fed], network.turn_next[fed])), shape=(size, size))
-    return np.asarray(spsolve(sp.csc_array(sp.eye_array(size)) - onward, own), dtype=float)
+    onward = sp.csr_array((network.fraction[fed], (network.turn_link[fed], network.turn_next[fed])), shape=(size, size))
+    remaining = own
+    for _ in range(MOST_LINKS):
+        remaining = own + onward @ remaining
+    return np.asarray(remaining, dtype=float)

@@ -19,6 +19,16 @@ from utn_sumo.contract import EXIT, Floats, Forecast, Ints, State
 from utn_sumo.errors import ControllerError
 
 TOLERANCE = 1e-9
+WIDER = (0.0, 1e-7, 1e-6)
+"""How much wider all bounds are made [veh, s] until there is an optimum.
+
+On a road without vehicles no flow has room between its bounds; an interior point method then has nowhere to stand,
+and its multipliers no end. A bound that gives way by so little changes the cost by as little times its multiplier.
+"""
+OUTWARD = {"h_l": -1, "h_u": 1, "x_l": -1, "x_u": 1}
+"""Which way each of the bounds is made wider."""
+MOST_ITERATIONS = 100
+"""Several times what a problem with an interior takes."""
 
 
 class WholeProblem:
@@ -47,7 +57,7 @@ class WholeProblem:
         self.equal = sp.vstack([coupling(problems, self.starts), *self._budget_rows()], format="csc")
         self._solver: Any = None
         self.iterations = 0
-        """Of the last solve."""
+        """Of the last solve, all its attempts together."""
         self._tolerance = tolerance
         self.hessian = sp.block_diag([sp.csc_matrix(problem.hessian) for problem in problems], format="csc")
 
@@ -93,24 +103,38 @@ class WholeProblem:
     def solve(self, programs: Sequence[QuadraticProgram], greens: Floats | None = None) -> tuple[float, list[Floats]]:
         """Least cost and each junction's solution; `greens` (Kc, S of the whole network) if they are fixed.
 
-        Raises ControllerError if the solver finds no optimum.
+        Primal and dual residual and duality gap are within the tolerance, absolute or relative, of a problem whose
+        bounds are at most the last of `WIDER` apart from those given. Raises ControllerError without such an optimum.
         """
         import piqp  # noqa: PLC0415 - compiled, loaded at use
 
         numbers = self.numbers(programs, greens)
-        if self._solver is None:
-            self._solver = piqp.SparseSolver()
-            self._solver.settings.eps_abs = self._solver.settings.eps_rel = self._tolerance
-            self._solver.setup(P=self.hessian, A=self.equal, **numbers)
-        else:
+        self.iterations = 0
+        for wider in WIDER:
+            self._load(numbers | {side: numbers[side] + sign * wider for side, sign in OUTWARD.items()})
+            status = self._solver.solve()
+            result = self._solver.result
+            self.iterations += int(result.info.iter)
+            if status == piqp.PIQP_SOLVED:
+                cost = result.info.primal_obj + sum(program.constant for program in programs)
+                return float(cost), self.parts(result.x)
+        raise ControllerError(f"the whole problem has no optimum ({status})")
+
+    def _load(self, numbers: dict[str, Any]) -> None:
+        """Hand the problem to the solver, which is set up once."""
+        import piqp  # noqa: PLC0415 - compiled, loaded at use
+
+        if self._solver is not None:
             self._solver.update(**numbers)
-        status = self._solver.solve()
-        if status != piqp.PIQP_SOLVED:
-            raise ControllerError(f"the whole problem has no optimum ({status})")
-        result = self._solver.result
-        self.iterations = int(result.info.iter)
-        cost = result.info.primal_obj + sum(program.constant for program in programs)
-        return float(cost), self.parts(result.x)
+            return
+        self._solver = piqp.SparseSolver()
+        settings = self._solver.settings
+        settings.eps_abs = settings.eps_rel = self._tolerance
+        settings.eps_duality_gap_abs = settings.eps_duality_gap_rel = self._tolerance
+        settings.max_iter = MOST_ITERATIONS
+        # In vehicles the problem is well scaled; scaled anew with every update it no longer is.
+        settings.preconditioner_iter = 0
+        self._solver.setup(P=self.hessian, A=self.equal, **numbers)
 
     def parts(self, solution: Floats) -> list[Floats]:
         """Each junction's part of a solution."""
