@@ -170,6 +170,23 @@ def _departs_s(element: ET.Element) -> float:
     return 0 if said == "triggered" else float(said)
 
 
+def _pockets() -> Streets:
+    """A crossroads whose arms have a second lane, for left turns, on the last 50 m before it."""
+    streets = row("C")
+    for edge in [edge for edge in streets.parts["edges"] if edge.attrib["to"] == "C"]:
+        streets.parts["edges"].remove(edge)
+    for start, x, y in (("W", -50, 0), ("E", 50, 0), ("nC", 0, 50), ("sC", 0, -50)):
+        streets.node(f"p{start}", x, y)
+        streets.one_way(start, f"p{start}")
+        streets.one_way(f"p{start}", "C", lanes=2)
+    return streets
+
+
+def _through_pockets() -> str:
+    ways = (("W", "E"), ("E", "W"), ("nC", "sC"), ("sC", "W"), ("nC", "E"), ("W", "nC"))
+    return "".join(flow(f"{a}_{b}", f"{a}-p{a}", f"C-{b}", period=10) for a, b in ways)
+
+
 def plain(folder: Path) -> Path:
     """Nothing odd: what the others differ from."""
     row("C").net(folder, NO_TURNAROUNDS)
@@ -329,6 +346,12 @@ def actuated(folder: Path) -> Path:
     return case(folder, traffic("AB"))
 
 
+def actuated_by_delay(folder: Path) -> Path:
+    """SUMO's other actuation, by the time that vehicles lose."""
+    row("AB").net(folder, NO_TURNAROUNDS, "--tls.default-type", "delay_based", "--tls.min-dur", "6")
+    return case(folder, traffic("AB"))
+
+
 def actuated_left_turns(folder: Path) -> Path:
     """The same with arrows for left turns, which may be as short as 5 s."""
     options = ("--tls.default-type", "actuated", "--tls.min-dur", "5", "--tls.left-green.time", "6")
@@ -337,13 +360,13 @@ def actuated_left_turns(folder: Path) -> Path:
 
 
 def short_greens(folder: Path) -> Path:
-    """An arrow for the left turns from the north that is green for 6 s only, all that there is for them."""
+    """A cycle of 42 s with arrows of 5 s for the left turns: ten seconds for each of four stages do not fit in."""
     shown = (
-        *((25, "GGrrrrGGrrrr"), (3, "yyrrrryyrrrr"), (1, DARK), (6, "rrGrrrrrGrrr"), (3, "rryrrrrryrrr")),
-        *((1, DARK), (17, EAST_WEST), (3, "rrryyyrrryyy"), (1, DARK)),
+        *((10, NORTH_SOUTH), (3, "yygrrryygrrr"), (5, "rrGrrrrrGrrr"), (3, "rryrrrrryrrr")),
+        *((10, EAST_WEST), (3, "rrryygrrryyg"), (5, "rrrrrGrrrrrG"), (3, "rrrrryrrrrry")),
     )
-    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
-    return case(folder, traffic("C"))
+    retime(_pockets().net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
+    return case(folder, _through_pockets())
 
 
 def several_programmes(folder: Path) -> Path:
@@ -363,6 +386,14 @@ def programmes_by_the_clock(folder: Path) -> Path:
     return case(folder, traffic("C"), waut + '<wautJunction wautID="clock" junctionID="C"/>')
 
 
+def phases_that_are_skipped(folder: Path) -> Path:
+    """At A a stage that the programme never comes to, since the phase before it leads back to the first; B as usual."""
+    logic = tl_logic("A", (*TWO_STAGES, (20, "GGGrrrrrrrrr"), (3, "yyyrrrrrrrrr")))
+    list(logic)[5].set("next", "0")
+    retime(row("AB").net(folder, NO_TURNAROUNDS), logic, tl_logic("B", TWO_STAGES))
+    return case(folder, traffic("AB"))
+
+
 OFFSETS_S = {"A": -25, "B": 200, "D": 12}
 
 
@@ -374,10 +405,11 @@ def offsets(folder: Path) -> Path:
 
 
 def fractions_of_seconds(folder: Path) -> Path:
-    """Clearances of 2.5 s and an offset of 4.5 s, in a cycle of whole seconds."""
+    """Clearances of 2.5 s and an offset of 4.5 s at A, in a cycle of whole seconds; B is as usual."""
     shown = [(2.5 if "G" not in state else seconds, state) for seconds, state in TWO_STAGES]
-    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", shown, offset=4.5))
-    return case(folder, traffic("C"))
+    net = row("AB").net(folder, NO_TURNAROUNDS)
+    retime(net, tl_logic("A", shown, offset=4.5), tl_logic("B", TWO_STAGES))
+    return case(folder, traffic("AB"))
 
 
 def fraction_in_the_cycle(folder: Path) -> Path:
@@ -455,10 +487,10 @@ def red_and_amber(folder: Path) -> Path:
 
 
 def green_beside_amber(folder: Path) -> Path:
-    """The right turn from the east is green while north and south clear, and the east is red and amber with it."""
+    """Right turns may pass on while all others clear, and clear while the street across is red and amber."""
     shown = (
-        *((25, "GGgrrrGGgrrr"), (3, "yyyGrryyyrrr"), (2, "rrrGuurrruuu"), (25, EAST_WEST)),
-        *((3, "rrryyyrrryyy"), (2, "uuurrruuurrr")),
+        *((25, NORTH_SOUTH), (3, "gyyrrrgyyrrr"), (2, "yrrrrryrrrrr"), (1, "yrruuuyrruuu"), (1, "rrruuurrruuu")),
+        *((23, EAST_WEST), (3, "rrryyyrrryyy"), (2, "uuurrruuurrr")),
     )
     retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
     return case(folder, traffic("C"))
@@ -486,23 +518,6 @@ def blinking_at_night(folder: Path) -> Path:
 
 
 # What streets are like
-
-
-def _pockets() -> Streets:
-    """A crossroads whose arms have a second lane, for left turns, on the last 50 m before it."""
-    streets = row("C")
-    for edge in [edge for edge in streets.parts["edges"] if edge.attrib["to"] == "C"]:
-        streets.parts["edges"].remove(edge)
-    for start, x, y in (("W", -50, 0), ("E", 50, 0), ("nC", 0, 50), ("sC", 0, -50)):
-        streets.node(f"p{start}", x, y)
-        streets.one_way(start, f"p{start}")
-        streets.one_way(f"p{start}", "C", lanes=2)
-    return streets
-
-
-def _through_pockets() -> str:
-    ways = (("W", "E"), ("E", "W"), ("nC", "sC"), ("sC", "W"), ("nC", "E"), ("W", "nC"))
-    return "".join(flow(f"{a}_{b}", f"{a}-p{a}", f"C-{b}", period=10) for a, b in ways)
 
 
 def turning_pockets(folder: Path) -> Path:
@@ -632,13 +647,11 @@ def sundry_trips(folder: Path) -> Path:
 
 
 def districts(folder: Path) -> Path:
-    """Trips between districts, a rerouter, and the user's own detectors with files of their own."""
+    """Trips between districts, and a rerouter that closes a street."""
     row("AB").net(folder, NO_TURNAROUNDS)
     zones = (
         '<taz id="west"><tazSource id="W-A" weight="1"/><tazSink id="A-W" weight="1"/></taz>'
         '<taz id="east"><tazSource id="E-B" weight="1"/><tazSink id="B-E" weight="1"/></taz>'
-        '<inductionLoop id="entry_W-A_0" lane="W-A_0" pos="5" period="60" file="theirs.xml"/>'
-        '<laneAreaDetector id="theirs" lane="A-B_0" pos="10" endPos="-5" period="60" file="theirs.xml"/>'
         '<rerouter id="re" edges="W-A"><interval begin="0" end="120"><closingReroute id="B-nB"/></interval></rerouter>'
     )
     between = "".join(
@@ -646,6 +659,31 @@ def districts(folder: Path) -> Path:
         for a, b in (("east", "west"), ("west", "east"))
     )
     return case(folder, traffic("AB") + between, zones)
+
+
+def detectors_like_ours(folder: Path) -> Path:
+    """Detectors of the user's own, with ids that we might have thought of."""
+    row("C").net(folder, NO_TURNAROUNDS)
+    own = "".join(
+        f'<inductionLoop id="{kind}_W-C_0" lane="W-C_0" pos="{at}" period="60" file="loops.xml"/>'
+        for kind, at in (("entry", 5), ("stop", -5))
+    )
+    area = '<laneAreaDetector id="area_W-C_0" lane="W-C_0" pos="10" endPos="-5" period="60" file="areas.xml"/>'
+    return case(folder, traffic("C"), own + area + '<timedEvent type="SaveTLSStates" source="C" dest="states.xml"/>')
+
+
+def flat_configuration(folder: Path) -> Path:
+    """Options without sections, outputs among them, a scale, a seed and a short name."""
+    row("C").net(folder, NO_TURNAROUNDS)
+    said = {"tripinfo-output": "theirs.xml", "summary-output": "sum.xml", "W": "true", "verbose": "true"}
+    return case(folder, traffic("C"), options=said | {"log": "theirs.log", "scale": "0.5", "seed": "77"})
+
+
+def side_by_side(folder: Path) -> Path:
+    """The sublane model, with bicycles beside cars on one lane."""
+    row("C").net(folder, NO_TURNAROUNDS)
+    riders = '<vType id="bike" vClass="bicycle" latAlignment="right"/>' + flow("bikes", "W-C", "C-E", type="bike")
+    return case(folder, riders + traffic("C"), options={"lateral-resolution": "0.8"})
 
 
 def half_second_steps(folder: Path) -> Path:
@@ -667,9 +705,9 @@ def late_begin(folder: Path) -> Path:
 
 
 def no_end(folder: Path) -> Path:
-    """No end: until everybody has arrived, or walked home."""
-    row("C").net(folder, NO_TURNAROUNDS, "--sidewalks.guess", "--crossings.guess")
-    return case(folder, traffic("C", end=120) + walkers("W-C", "C-E", end="60"), end=None)
+    """No end: until everybody has arrived, or walked home round the corner, which takes some longer than any drive."""
+    row("C").net(folder, NO_TURNAROUNDS, "--sidewalks.guess", "--walkingareas")
+    return case(folder, traffic("C", end=120) + walkers("nC-C", "C-W", end="90"), end=None)
 
 
 def teleports(folder: Path) -> Path:
@@ -699,6 +737,12 @@ def nothing_to_control(folder: Path) -> Path:
     return case(folder, traffic("C"))
 
 
+def mesoscopic(folder: Path) -> Path:
+    """SUMO's mesoscopic model, which has no lane-area detectors."""
+    row("C").net(folder, NO_TURNAROUNDS)
+    return case(folder, traffic("C"), options={"mesosim": "true", "meso-junction-control": "true"})
+
+
 CASES: tuple[Callable[[Path], Path], ...] = (
     plain,
     pedestrians,
@@ -712,10 +756,12 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     one_stage,
     joined,
     actuated,
+    actuated_by_delay,
     actuated_left_turns,
     short_greens,
     several_programmes,
     programmes_by_the_clock,
+    phases_that_are_skipped,
     offsets,
     fractions_of_seconds,
     fraction_in_the_cycle,
@@ -741,6 +787,9 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     zipped,
     sundry_trips,
     districts,
+    detectors_like_ours,
+    flat_configuration,
+    side_by_side,
     half_second_steps,
     tenth_second_steps,
     late_begin,
@@ -752,5 +801,6 @@ REFUSED: dict[Callable[[Path], Path], str] = {
     no_internal_links: "internal links",
     no_signals: "no traffic lights",
     nothing_to_control: "no signals that can be controlled",
+    mesoscopic: "mesosim",
 }
 """What only `native` runs, and what the others say."""

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from utn_sumo import bridge, case
 from utn_sumo.cli import cli
-from utn_sumo.errors import NetworkError
+from utn_sumo.errors import UtnError
 from utn_sumo.plant.sumo import PROGRAM
 from utn_sumo.scenario import scenario
 from utn_sumo.sumo_tools import sumo_binary
@@ -37,8 +37,15 @@ LEFT_ALONE: dict[Make, set[str]] = {
     odd_nets.blinking_at_night: {"C"},
 }
 """Signals that nobody can control; every other one has to be controlled."""
-EITHER = {odd_nets.programmes_by_the_clock, odd_nets.fractions_of_seconds, odd_nets.fraction_in_the_cycle}
+EITHER = {
+    odd_nets.programmes_by_the_clock,
+    odd_nets.phases_that_are_skipped,
+    odd_nets.fractions_of_seconds,
+    odd_nets.fraction_in_the_cycle,
+}
 """Where it may be left alone as well, if the reason is named."""
+NEAR_VEH = 4
+"""Vehicles on a link that an estimate may be wrong by: what starts amid links is not announced."""
 CLEARS = frozenset("yYu")
 GREEN = frozenset("Gg")
 
@@ -122,15 +129,18 @@ def greens_s(seen: Shown, letter: int) -> list[float]:
 
 
 def programmes(file: Path) -> dict[str, Shown]:
-    """The phases of every signal's own programme: the last one that SUMO reads."""
+    """The phases of every signal's own programme, the last one that SUMO reads, as far as it comes to them."""
     chosen = case.read(file)
     found: dict[str, Shown] = {}
     for path in (chosen.net_file, *chosen.additional_files):
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as content:
             root = ET.parse(content).getroot()
         for logic in root.iter("tlLogic"):
-            phases = [(item.attrib["state"], float(item.attrib["duration"])) for item in logic.iter("phase")]
-            found[logic.attrib["id"]] = phases
+            phases, reached = list(logic.iter("phase")), [0]
+            while phases and (after := int(phases[reached[-1]].get("next", reached[-1] + 1)) % len(phases)):
+                reached.append(after)
+            shows = [(item.attrib["state"], float(item.attrib["duration"])) for item in phases]
+            found[logic.attrib["id"]] = [shows[place] for place in reached] if shows else []
     return found
 
 
@@ -218,15 +228,19 @@ def test_phases_keep_their_order_and_clearances_their_seconds(
 ) -> None:
     result, folder = ran(make, "dmpc")
     own = programmes(made(make))
+    step_s = float(dict(case.read(made(make)).options).get("step-length", "1"))
     for signal in own.keys() - result["left_alone"].keys():
         states = [state for state, _ in own[signal]]
+        assert states, f"{signal} has no programme to keep to"
         follows = set(zip(states, [*states[1:], states[0]], strict=True)) | {(state, state) for state in states}
         seen = shown(folder, signal)
         assert len(seen) >= len(states)
         for (state, seconds), (after, _) in pairwise(seen):
             assert (state, after) in follows, signal
             if CLEARS & set(state) or not GREEN & set(state):
-                assert seconds in {length for each, length in own[signal] if each == state}, (signal, state)
+                lengths = {length for each, length in own[signal] if each == state}
+                # What is no multiple of a step SUMO rounds up and down in turn.
+                assert any(abs(seconds - length) < step_s for length in lengths), (signal, state, seconds, lengths)
 
 
 @every_case
@@ -238,7 +252,15 @@ def test_no_stream_turns_green_sooner_after_another_than_in_the_nets_own_program
     for signal in own.keys() - result["left_alone"].keys():
         least = gaps_s(3 * own[signal])
         for pair, seconds in gaps_s(shown(folder, signal)).items():
-            assert seconds >= least[pair], (signal, pair)
+            assert seconds >= least.get(pair, 0), (signal, pair)
+
+
+@every_case
+def test_the_estimate_of_who_is_on_a_link_stays_near_the_truth(make: Make, ran: Run) -> None:
+    _, folder = ran(make, "dmpc")
+    lines = [json.loads(line) for line in (folder / "cycles.jsonl").read_text(encoding="utf-8").splitlines()]
+    for line, after in pairwise(lines):
+        assert after["state"]["x_veh"] == pytest.approx(line["truth"]["x_veh"], abs=NEAR_VEH)
 
 
 @every_controller
@@ -369,6 +391,23 @@ def test_who_stands_too_long_is_taken_away_as_the_scenario_wants(controller: str
     assert ran(odd_nets.teleports, controller)[0]["teleports"] > 0
 
 
+@every_controller
+def test_outputs_that_a_scenario_asks_for_are_not_written_where_its_files_are(controller: str, tmp_path: Path) -> None:
+    file = odd_nets.flat_configuration(tmp_path)
+    bridge.run(scenario(net=str(file), controller=controller), tmp_path / "run")
+    assert not {path.name for path in tmp_path.iterdir()} & {"theirs.xml", "sum.xml", "theirs.log"}
+
+
+def test_a_scenario_s_own_scale_is_scaled_further(tmp_path: Path) -> None:
+    file = odd_nets.flat_configuration(tmp_path)
+    once, twice = (
+        bridge.run(scenario(net=str(file), controller="native", demand=scale), tmp_path / str(scale))
+        for scale in (1.0, 2.0)
+    )
+    vehicles = [result["arrived"] + result["unfinished"] for result in (once, twice)]
+    assert vehicles[1] == pytest.approx(2 * vehicles[0], rel=0.05)
+
+
 @pytest.mark.parametrize("controller", ["native", *CONTROLLERS])
 def test_zipped_files_give_the_same_trips(controller: str, ran: Run) -> None:
     assert trips(ran(odd_nets.zipped, controller)[1]) == trips(ran(odd_nets.plain, controller)[1])
@@ -379,12 +418,19 @@ def test_every_stream_that_shares_a_letter_is_served(made: Callable[[Make], Path
     assert net.serves.any(axis=0).all()
 
 
+def test_a_turn_that_passes_the_signals_by_waits_for_no_stage(made: Callable[[Make], Path]) -> None:
+    net = bridge.controllable(case.read(made(odd_nets.slip_lanes)))
+    past = {("nC-C", "C-W"), ("W-C", "C-sC")}
+    turns = [index for index, turn in enumerate(net.turns) if (net.links[turn.link].id, turn.to_edge) in past]
+    assert net.serves[:, turns].all()
+
+
 @pytest.mark.parametrize("make", odd_nets.REFUSED, ids=lambda make: make.__name__)
 @every_controller
 def test_what_can_not_be_controlled_is_refused_in_one_line(
     make: Make, controller: str, made: Callable[[Make], Path], tmp_path: Path
 ) -> None:
-    with pytest.raises(NetworkError, match=odd_nets.REFUSED[make]) as caught:
+    with pytest.raises(UtnError, match=odd_nets.REFUSED[make]) as caught:
         bridge.run(scenario(net=str(made(make)), controller=controller), tmp_path / "run")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
