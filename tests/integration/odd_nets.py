@@ -196,11 +196,11 @@ def plain(folder: Path) -> Path:
 # Who is on the road
 
 
-def walkers(here: str, there: str, **more: str) -> str:
+def walkers(here: str, there: str, arrival: str = "max", **more: str) -> str:
     """People who walk from one street to another, one every 10 s."""
     said = {"id": f"walk_{here}_{there}", "begin": "0", "end": "200", "period": "10"} | more
     root = ET.Element("personFlow", said)
-    _add(root, "walk", **{"from": here, "to": there})
+    _add(root, "walk", **{"from": here, "to": there, "arrivalPos": arrival})
     return text_of(root)
 
 
@@ -241,7 +241,7 @@ def crossing_amid_a_street(folder: Path) -> Path:
         ET.Element("crossing", {"node": "M", "edges": "E-M M-E", "priority": "1", "width": "4"})
     )
     streets.net(folder, NO_TURNAROUNDS, "--sidewalks.guess")
-    people = walkers("E-M", "M-E", id="across") + walkers("W-C", "M-F")
+    people = walkers("E-M", "M-E", "30", id="across", end="120", departPos="150") + walkers("W-C", "M-F")
     return case(folder, traffic("C") + flow("out", "W-C", "M-F") + flow("in", "F-M", "C-W") + people)
 
 
@@ -357,6 +357,22 @@ def actuated_left_turns(folder: Path) -> Path:
     options = ("--tls.default-type", "actuated", "--tls.min-dur", "5", "--tls.left-green.time", "6")
     _pockets().net(folder, NO_TURNAROUNDS, *options)
     return case(folder, _through_pockets())
+
+
+def dual_ring(folder: Path) -> Path:
+    """A NEMA controller at C, which runs two rings of phases side by side; H is as usual."""
+    net = row("CH", lanes=2).net(folder, NO_TURNAROUNDS, "--tls.default-type", "NEMA")
+    shown = ((27, 2 * "GGGgrrrr"), (3, 2 * "yyyyrrrr"), (27, 2 * "rrrrGGGg"), (3, 2 * "rrrryyyy"))
+    retime(net, tl_logic("H", shown))
+    return case(folder, traffic("CH"))
+
+
+def slow_and_fast(folder: Path) -> Path:
+    """A cycle of 400 s, longer than the window, beside one of 40 s."""
+    slow = [(195 if "G" in state else seconds, state) for seconds, state in TWO_STAGES]
+    fast = [(15 if "G" in state else seconds, state) for seconds, state in TWO_STAGES]
+    retime(row("AB").net(folder, NO_TURNAROUNDS), tl_logic("A", slow, offset=130), tl_logic("B", fast))
+    return case(folder, traffic("AB"))
 
 
 def short_greens(folder: Path) -> Path:
@@ -687,15 +703,23 @@ def side_by_side(folder: Path) -> Path:
 
 
 def half_second_steps(folder: Path) -> Path:
-    """Steps of half a second, and of a window whose length is no multiple of the cycle."""
+    """Steps of half a second, in a window that begins between two seconds and is no multiple of the cycle."""
     row("C").net(folder, NO_TURNAROUNDS)
-    return case(folder, traffic("C"), options={"step-length": "0.5"}, end="250.5")
+    return case(folder, traffic("C"), options={"step-length": "0.5"}, begin="30.5", end="281")
 
 
 def tenth_second_steps(folder: Path) -> Path:
     """Steps of a tenth of a second, with the ballistic update."""
     row("C").net(folder, NO_TURNAROUNDS)
     return case(folder, traffic("C"), options={"step-length": "0.1", "step-method.ballistic": "true"}, end="130")
+
+
+def folder_with_spaces(folder: Path) -> Path:
+    """A scenario in a folder such as people have."""
+    place = folder / "my town (north)"
+    place.mkdir()
+    row("C").net(place, NO_TURNAROUNDS)
+    return case(place, traffic("C"), '<poi id="fountain" x="0" y="0"/>')
 
 
 def late_begin(folder: Path) -> Path:
@@ -758,6 +782,8 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     actuated,
     actuated_by_delay,
     actuated_left_turns,
+    dual_ring,
+    slow_and_fast,
     short_greens,
     several_programmes,
     programmes_by_the_clock,
@@ -792,6 +818,7 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     side_by_side,
     half_second_steps,
     tenth_second_steps,
+    folder_with_spaces,
     late_begin,
     no_end,
     teleports,

@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from utn_sumo import bridge, case
+from utn_sumo import bridge, case, inspection
 from utn_sumo.cli import cli
 from utn_sumo.errors import UtnError
 from utn_sumo.plant.sumo import PROGRAM
@@ -40,6 +40,7 @@ LEFT_ALONE: dict[Make, set[str]] = {
 EITHER = {
     odd_nets.programmes_by_the_clock,
     odd_nets.phases_that_are_skipped,
+    odd_nets.dual_ring,
     odd_nets.fractions_of_seconds,
     odd_nets.fraction_in_the_cycle,
 }
@@ -130,6 +131,17 @@ def greens_s(seen: Shown, letter: int) -> list[float]:
     return [sum(span) for span in (spans[:-1] if was else spans)]
 
 
+def red_before_green_s(seen: Shown, one: int, other: int) -> list[float]:
+    """How long a letter had not been green any more each time another turned green."""
+    found, since, was = [], 0.0, True
+    for state, seconds in seen:
+        now = state[other] in GREEN
+        if now and not was:
+            found.append(since)
+        since, was = 0.0 if state[one] in GREEN else since + seconds, now
+    return found
+
+
 def programmes(file: Path) -> dict[str, Shown]:
     """The phases of every signal's own programme, the last one that SUMO reads, as far as it comes to them."""
     chosen = case.read(file)
@@ -158,15 +170,23 @@ def controlled(folder: Path, signals: Iterable[str]) -> set[str]:
     return {signal for signal in signals if any(program == PROGRAM for *_, program in switches(folder, signal))}
 
 
+def clears(state: str) -> bool:
+    """Whether somebody has yellow, or red and amber, or nobody has green."""
+    return bool(CLEARS & set(state)) or not GREEN & set(state)
+
+
 def gaps_s(seen: Shown) -> dict[tuple[int, int], float]:
-    """Shortest time from one letter's green to another's, where nobody else's green began between the two."""
+    """Least seconds that clear between one letter's green and another's, where nobody else's began between the two.
+
+    Seconds in which somebody is green and nobody yellow may be a stage of its own, and are not counted.
+    """
     found: dict[tuple[int, int], float] = {}
     for start, (state, _) in enumerate(seen[:-1]):
         ended = [letter for letter, shows in enumerate(state) if shows in GREEN and seen[start + 1][0][letter] != shows]
         ended = [letter for letter in ended if seen[start + 1][0][letter] not in GREEN]
         passed = 0.0
         for (before, seconds), (after, _) in zip(seen[start + 1 :], seen[start + 2 :], strict=False):
-            passed += seconds
+            passed += seconds if clears(before) else 0
             begun = [i for i, shows in enumerate(after) if shows in GREEN and before[i] not in GREEN]
             for pair in ((one, other) for one in ended for other in begun if one != other):
                 found[pair] = min(passed, found.get(pair, passed))
@@ -239,10 +259,10 @@ def test_phases_keep_their_order_and_clearances_their_seconds(
         assert states, f"{signal} has no programme to keep to"
         follows = set(zip(states, [*states[1:], states[0]], strict=True)) | {(state, state) for state in states}
         seen = shown(folder, signal)
-        assert len(seen) >= len(states)
+        assert seen
         for (state, seconds), (after, _) in pairwise(seen):
             assert (state, after) in follows, signal
-            if CLEARS & set(state) or not GREEN & set(state):
+            if clears(state):
                 lengths = {length for each, length in own[signal] if each == state}
                 # What is no multiple of a step SUMO rounds up and down in turn.
                 assert any(abs(seconds - length) < step_s for length in lengths), (signal, state, seconds, lengths)
@@ -279,9 +299,8 @@ def test_crossings_are_green_as_long_as_the_net_demands_and_cleared_while_their_
         assert len(greens) >= 2
         assert min(greens) >= odd_nets.CROSSING_LEAST_S
     # Letter 12 crosses the northern arm, out of which 0 to 2 come; 13 the eastern, with 3 to 5.
-    gaps = gaps_s(seen)
     for crossing, stream in ((12, 1), (13, 4)):
-        assert gaps[crossing, stream] >= odd_nets.CROSSING_CLEARS_S + 4
+        assert min(red_before_green_s(seen, crossing, stream)) >= odd_nets.CROSSING_CLEARS_S + 4
     # Their street's own green goes on while they clear.
     assert {state: seconds for state, seconds in seen if state == "GGgrrrGGgrrrrrrr"} == {
         "GGgrrrGGgrrrrrrr": odd_nets.CROSSING_CLEARS_S
@@ -296,7 +315,7 @@ def test_pedestrians_amid_a_street_get_their_green_and_across(controller: str, r
     assert len(greens) >= 3
     assert min(greens) >= 4
     crossed = {name: arrival for name, arrival in trips(folder).items() if name.startswith("across")}
-    assert len(crossed) == 20
+    assert len(crossed) == 12
     assert "-1" not in crossed.values()
 
 
@@ -337,10 +356,9 @@ def test_red_and_amber_is_shown_before_every_green(controller: str, ran: Run) ->
 @every_controller
 def test_arrows_shorter_than_our_own_least_green_are_still_shown(controller: str, ran: Run) -> None:
     _, folder = ran(odd_nets.short_greens, controller)
-    greens = greens_s(shown(folder, "C"), 2)
-    assert len(greens) >= 3
-    # What else has a green of six seconds in the net's own programme has no use for less.
-    assert min(greens) >= 5
+    arrows = [seconds for state, seconds in shown(folder, "C") if state in {"rrGrrrrrGrrr", "rrrrrGrrrrrG"}]
+    assert len(arrows) >= 8
+    assert min(arrows) >= 4
 
 
 def test_the_last_programme_that_is_read_is_the_one_to_start_from(made: Callable[[Make], Path], ran: Run) -> None:
@@ -416,6 +434,16 @@ def test_a_scenario_s_own_scale_is_scaled_further(tmp_path: Path) -> None:
 @pytest.mark.parametrize("controller", ["native", *CONTROLLERS])
 def test_zipped_files_give_the_same_trips(controller: str, ran: Run) -> None:
     assert trips(ran(odd_nets.zipped, controller)[1]) == trips(ran(odd_nets.plain, controller)[1])
+
+
+@pytest.mark.parametrize("make", [odd_nets.pedestrians, odd_nets.bicycle_lanes], ids=lambda make: make.__name__)
+def test_sidewalks_and_bicycle_lanes_hold_no_cars(make: Make, made: Callable[[Make], Path]) -> None:
+    links, usual = (
+        {link["id"]: link for link in inspection.inspect(bridge.controllable(case.read(made(each))))["links"]}
+        for each in (make, odd_nets.plain)
+    )
+    assert links["W-C"]["storage_veh"] == pytest.approx(usual["W-C"]["storage_veh"], rel=0.1)
+    assert links["W-C"]["saturation_flow_veh_h"] == pytest.approx(usual["W-C"]["saturation_flow_veh_h"])
 
 
 def test_every_stream_that_shares_a_letter_is_served(made: Callable[[Make], Path]) -> None:
