@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from utn_sumo import bridge, case, inspection
+from utn_sumo import bridge, case, inspection, monitor
 from utn_sumo.cli import cli
 from utn_sumo.errors import UtnError
 from utn_sumo.plant.sumo import PROGRAM
@@ -278,6 +278,30 @@ def test_no_stream_turns_green_sooner_after_another_than_in_the_nets_own_program
         least = gaps_s(3 * own[signal])
         for pair, seconds in gaps_s(shown(folder, signal)).items():
             assert seconds >= least.get(pair, 0), (signal, pair)
+
+
+# A change of programmes cuts a green short, which is what the monitor is there to see.
+@pytest.mark.parametrize(
+    "make",
+    [make for make in odd_nets.CASES if make is not odd_nets.programmes_by_the_clock],
+    ids=lambda make: make.__name__,
+)
+def test_the_monitor_has_nothing_to_say_against_a_nets_own_programme(
+    make: Make, made: Callable[[Make], Path], ran: Run
+) -> None:
+    chosen = case.read(made(make))
+    result, folder = ran(make, "native")
+    net = bridge.controllable(chosen)
+    verdict = monitor.watch(net, folder / "signals.xml", result["hours"] * 3600, chosen.begin_s)
+    assert not verdict.reasons
+
+
+@pytest.mark.parametrize("make", LEFT_ALONE, ids=lambda make: make.__name__)
+@every_controller
+def test_signals_left_alone_show_what_they_show_without_us(make: Make, controller: str, ran: Run) -> None:
+    (_, folder), (_, native) = ran(make, controller), ran(make, "native")
+    for signal in LEFT_ALONE[make]:
+        assert switches(folder, signal) == switches(native, signal)
 
 
 @every_case
