@@ -80,7 +80,7 @@ def run(
     ):
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
-        recorder = recording.Recorder(folder, {"scenario": scenario.model_dump(), "versions": _versions(plant.version)})
+        recorder = recording.Recorder(folder, _settings(scenario, chosen, plant.version))
         state = estimator.initial()
         try:
             for step in range(steps):
@@ -220,6 +220,11 @@ def _default_name(scenario: Scenario) -> str:
         Path(part.partition(":")[0]).name.partition(".")[0] for part in (scenario.net, scenario.controller)
     )
     return f"{net}-{controller}-demand{scenario.demand:g}-seed{scenario.seed}"
+
+
+def _settings(scenario: Scenario, chosen: Case | None, sumo: str) -> dict[str, Any]:
+    brought = {} if chosen is None else {"case": chosen.record()}
+    return {"scenario": scenario.model_dump(), **brought, "versions": _versions(sumo)}
 
 
 def _versions(sumo: str) -> dict[str, str]:

@@ -6,9 +6,14 @@ What SUMO is to write and to show is left out; that is ours to say.
 from __future__ import annotations
 
 import gzip
+import hashlib
 import math
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
 
 from utn_sumo.errors import SettingError
 
@@ -17,8 +22,16 @@ DEFAULT_TELEPORT_S = 300.0
 """SUMO's own."""
 ABOUT_OUTPUT = frozenset({"output", "report", "gui_only"})
 """Sections of a configuration that say what SUMO writes and shows."""
+SHOWN = frozenset({"log", "error-log", "message-log", "no-step-log", "no-warnings", "verbose", "gui-settings-file"})
+"""Options that say so wherever they stand: SUMO takes no notice of sections."""
 OURS = frozenset({"net-file", "route-files", "additional-files", "begin", "end", "seed", "random"})
 """Options that the fields of a `Case` stand for, and the seed."""
+FILES = ("weight-files", "load-state")
+"""Further options that name files to read."""
+LONG = {"n": "net-file", "r": "route-files", "a": "additional-files", "b": "begin", "e": "end", "w": "weight-files"}
+LONG |= {"net": "net-file", "routes": "route-files", "additional": "additional-files", "weights": "weight-files"}
+"""SUMO's short and older names of options."""
+UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 
 
 @dataclass(frozen=True)
@@ -35,57 +48,94 @@ class Case:
     teleport_s: float
     """Time that a vehicle stands before SUMO takes it out of the way; none is ever where it is not positive."""
     options: tuple[tuple[str, str], ...]
-    """Whatever else it says of SUMO's options, as (name, value)."""
+    """Whatever else it says of SUMO's options, as (name, value); files among them as paths that hold from here."""
+
+    @property
+    def step_s(self) -> float:
+        """Length of SUMO's steps."""
+        return seconds(dict(self.options).get("step-length", "1"))
+
+    @property
+    def further_files(self) -> dict[str, tuple[Path, ...]]:
+        """Files that its options name, by option."""
+        said = dict(self.options)
+        return {name: tuple(map(Path, said[name].split(","))) for name in FILES if name in said}
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that it reads but the .sumocfg itself."""
+        further = (path for paths in self.further_files.values() for path in paths)
+        return (self.net_file, *self.route_files, *self.additional_files, *further)
+
+    def record(self) -> dict[str, Any]:
+        """It as plain data, for a run's settings: files by their absolute paths, and what was in them by SHA-256."""
+        return {
+            "file": str(self.file.resolve()),
+            "net_file": str(self.net_file.resolve()),
+            "route_files": [str(path.resolve()) for path in self.route_files],
+            "additional_files": [str(path.resolve()) for path in self.additional_files],
+            "begin_s": self.begin_s,
+            "end_s": self.end_s,
+            "step_s": self.step_s,
+            "teleport_s": self.teleport_s,
+            "options": {
+                **dict(self.options),
+                **{name: _joined(path.resolve() for path in paths) for name, paths in self.further_files.items()},
+            },
+            "sha256": {str(path.resolve()): digest(path) for path in self.files},
+        }
+
+    @classmethod
+    def recorded(cls, content: Mapping[str, Any]) -> Case:
+        """The case of such a record. Raises KeyError or TypeError if it is none."""
+        return cls(
+            file=Path(content["file"]),
+            net_file=Path(content["net_file"]),
+            route_files=tuple(map(Path, content["route_files"])),
+            additional_files=tuple(map(Path, content["additional_files"])),
+            begin_s=float(content["begin_s"]),
+            end_s=content["end_s"],
+            teleport_s=float(content["teleport_s"]),
+            options=tuple(content["options"].items()),
+        )
 
     def arguments(self, additional: list[Path]) -> list[str]:
         """SUMO's arguments for it, with further additional files."""
         files = [*self.additional_files, *additional]
-        words = ["--net-file", str(self.net_file), "--begin", f"{self.begin_s:g}"]
+        words = ["--net-file", str(self.net_file), "--begin", in_digits(self.begin_s)]
         if self.route_files:
-            words += ["--route-files", ",".join(map(str, self.route_files))]
+            words += ["--route-files", _joined(self.route_files)]
         if files:
-            words += ["--additional-files", ",".join(map(str, files))]
+            words += ["--additional-files", _joined(files)]
         if self.end_s is not None:
-            words += ["--end", f"{self.end_s:g}"]
+            words += ["--end", in_digits(self.end_s)]
         return [*words, *(word for name, value in self.options for word in (f"--{name}", value))]
 
 
 def read(path: Path) -> Case:
     """Read a .sumocfg. Raises SettingError with one line if it can't be used."""
-    from defusedxml import ElementTree  # noqa: PLC0415
-    from defusedxml.common import DefusedXmlException  # noqa: PLC0415
-
-    try:
-        root = ElementTree.parse(path, forbid_dtd=True).getroot()
-    except (OSError, ElementTree.ParseError, DefusedXmlException) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise SettingError(f"scenario {str(path)!r} can't be read ({reason}): give a .sumocfg") from error
     said: dict[str, str] = {}
-    for section in root:
-        if section.tag in ABOUT_OUTPUT:
-            continue
+    for section in elements(path, "scenario", "give a .sumocfg"):
         for option in [section, *section]:
-            value = option.get("value", option.get("v"))
-            if value is not None:
-                said[LONG.get(option.tag, option.tag)] = value
+            name, value = LONG.get(option.tag, option.tag), option.get("value", option.get("v"))
+            if value is not None and not (section.tag in ABOUT_OUTPUT or name in SHOWN or "-output" in name):
+                said[name] = value
     if "net-file" not in said:
         raise SettingError(f"scenario {str(path)!r} names no net-file: give a whole .sumocfg")
-
-    def files(name: str) -> tuple[Path, ...]:
-        found = tuple(path.parent / word.strip() for word in said.get(name, "").split(",") if word.strip())
-        for each in found:
-            if not each.is_file():
-                raise SettingError(f"scenario {str(path)!r} names {str(each)!r} as {name}: there is no such file")
-            _check(each, name)
-        return found
-
+    found = {name: _files(path, name, said.get(name, "")) for name in ("net-file", "route-files", "additional-files")}
+    if len(found["net-file"]) != 1:
+        raise SettingError(f"scenario {str(path)!r}: net-file is {said['net-file']!r}: name one file")
+    for name in FILES:
+        if name in said:
+            said[name] = _joined(_files(path, name, said[name]))
     end_s = _seconds(path, "end", said["end"]) if "end" in said else -1.0
-    (net_file,) = files("net-file")
+    if not _seconds(path, "step-length", said.get("step-length", "1")) > 0:
+        raise SettingError(f"scenario {str(path)!r}: step-length is {said['step-length']!r}: make it more than 0 s")
     return Case(
         file=path,
-        net_file=net_file,
-        route_files=files("route-files"),
-        additional_files=files("additional-files"),
+        net_file=found["net-file"][0],
+        route_files=found["route-files"],
+        additional_files=found["additional-files"],
         begin_s=_seconds(path, "begin", said.get("begin", "0")),
         end_s=end_s if end_s >= 0 else None,
         teleport_s=_seconds(path, "time-to-teleport", said.get("time-to-teleport", str(DEFAULT_TELEPORT_S))),
@@ -93,33 +143,79 @@ def read(path: Path) -> Case:
     )
 
 
-def _check(path: Path, name: str) -> None:
-    """Raise SettingError unless a file is whole XML that declares no entities: SUMO would read whatever it says."""
+def elements(
+    path: Path, name: str = "file", remedy: str = "give whole XML without entities", within: tuple[Path, ...] = ()
+) -> Iterator[Element]:
+    """The elements at the top of an XML file (.gz too), one by one; each is gone when the next is read.
+
+    A file that it includes stands in its place, as in SUMO; `within` are the files that include this one. Raises
+    SettingError under the given name if a file can't be opened, is cut off, includes itself, or declares entities,
+    which could blow up.
+    """
     from defusedxml import ElementTree  # noqa: PLC0415
     from defusedxml.common import DefusedXmlException  # noqa: PLC0415
 
+    if path in within:
+        raise SettingError(f"{name} {str(path)!r} includes itself: {remedy}")
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            for _, element in ElementTree.iterparse(file, forbid_dtd=True):
-                element.clear()
-    except (OSError, EOFError, ElementTree.ParseError, DefusedXmlException) as error:
+            above: list[Element] = []
+            for event, element in ElementTree.iterparse(file, events=("start", "end"), forbid_dtd=True):
+                if event == "start":
+                    above.append(element)
+                    continue
+                above.pop()
+                if element.tag == "include":
+                    included = path.parent / element.get("href", "")
+                    yield from elements(included, name, remedy, (*within, path))
+                elif len(above) == 1:
+                    yield element
+                    above[0].clear()
+    except (OSError, EOFError, zlib.error, ElementTree.ParseError, DefusedXmlException, LookupError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise SettingError(f"{name} {str(path)!r} can't be read ({reason}): give whole XML without entities") from error
+        raise SettingError(f"{name} {str(path)!r} can't be read ({reason}): {remedy}") from error
 
 
-LONG = {"n": "net-file", "r": "route-files", "a": "additional-files", "b": "begin", "e": "end"}
-"""SUMO's short names of options, and the older `net`."""
+def digest(path: Path) -> str:
+    """SHA-256 of a file's content."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _seconds(path: Path, name: str, text: str) -> float:
-    """A time as SUMO writes it: seconds, or hours, minutes and seconds (and days before them) with colons."""
-    try:
-        parts = [float(part) for part in text.split(":")]
-    except ValueError:
-        parts = [math.nan]
+def in_digits(time_s: float) -> str:
+    """A time for SUMO, to the millisecond that it knows."""
+    return f"{round(time_s, 3):.15g}"
+
+
+def seconds(text: str) -> float:
+    """A time as SUMO writes it: seconds, or hours, minutes and seconds (and days before them) with colons.
+
+    Raises ValueError if it is none.
+    """
+    parts = [float(part) for part in text.split(":")]
     if len(parts) > len(UNITS_S) or not all(map(math.isfinite, parts)):
-        raise SettingError(f"scenario {str(path)!r}: {name} is {text!r}, which is no time in seconds")
+        raise ValueError(text)
     return sum(part * unit for part, unit in zip(reversed(parts), UNITS_S, strict=False))
 
 
-UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
+def _seconds(path: Path, name: str, text: str) -> float:
+    try:
+        return seconds(text)
+    except ValueError as error:
+        raise SettingError(f"scenario {str(path)!r}: {name} is {text!r}, which is no time in seconds") from error
+
+
+def _files(path: Path, name: str, text: str) -> tuple[Path, ...]:
+    """The files that an option names, from the folder of its .sumocfg; SUMO would read whatever is in them."""
+    found = tuple(path.parent / word.strip() for word in text.split(",") if word.strip())
+    for each in found:
+        if not each.is_file():
+            what = "that is a folder" if each.is_dir() else "there is no such file"
+            raise SettingError(f"scenario {str(path)!r} names {str(each)!r} as {name}: {what}")
+        for _ in elements(each, name):
+            pass
+    return found
+
+
+def _joined(paths: Iterable[Path]) -> str:
+    return ",".join(map(str, paths))
