@@ -60,6 +60,8 @@ DAY_S = 86400.0
 """How long SUMO lets a flow last that has no end, where the window has none either."""
 WHENEVER = frozenset({"triggered", "containerTriggered", "split", "begin", "now"})
 """Departures that are no time: they are taken to be within the window."""
+ROUNDING_VEH = 1e-6
+"""What the times of a flow's departures are uncertain by, in vehicles."""
 DRIVES, WAYS = frozenset({"vehicle", "trip", "flow"}), frozenset({"route", "routeDistribution"})
 
 
@@ -204,7 +206,7 @@ class _Reader:
         return self.begin_s <= self._time_s(element, "depart", None) < self.end_s
 
     def _flow_veh(self, element: Element) -> float:
-        """Vehicles of a flow that depart within the window, on average where they depart by chance."""
+        """Vehicles of a flow that depart within the window: on average, where they depart by chance."""
         begin_s = self._time_s(element, "begin", self.begin_s)
         # As SUMO has it: without an end of its own a flow lasts as long as the window, or a day.
         end_s = self._time_s(element, "end", self.end_s if self.end_s < math.inf else begin_s + DAY_S)
@@ -218,7 +220,14 @@ class _Reader:
             rate_veh_s = number / (end_s - begin_s)
         elif number is not None:
             end_s = begin_s + number / rate_veh_s
-        return rate_veh_s * max(0.0, min(end_s, self.end_s) - max(begin_s, self.begin_s))
+        by_chance = "probability" in element.attrib or element.get("period", "").startswith("exp")
+
+        def until_veh(time_s: float) -> float:
+            """Vehicles that depart before a time; those at even distances do so at its start."""
+            veh = rate_veh_s * max(0.0, min(time_s, end_s) - begin_s)
+            return veh if by_chance else math.ceil(veh - ROUNDING_VEH)
+
+        return max(0.0, until_veh(self.end_s) - until_veh(self.begin_s))
 
     def _rate_veh_s(self, element: Element) -> float | None:
         """Vehicles a second, if the flow says so in any of SUMO's ways."""
