@@ -1,7 +1,7 @@
 """Somebody else's scenario as a folder of its own: complete, with all that the bench knows of it, for anybody to run.
 
 scenario.sumocfg        window, step, teleport and every other option, by names that hold wherever the folder lies
-the input files         unchanged, but for what additional files want written: that goes nowhere
+the input files         unchanged, but for the files that they name, and those that they want written: these go nowhere
 NET.turns.xml           turning fractions, as the routes have them
 NET.calibration.json    the model's parameters, where they have been fitted
 detectors.add.xml       our detectors: no part of the scenario, since every run brings its own
@@ -39,6 +39,8 @@ WRITES = {"timedEvent": "dest", "calibrator": "output"} | dict.fromkeys(
     "file",
 )
 """Elements of additional files that have SUMO write a file, and the attribute that names it."""
+SIGNS = (b"<include", b"file=", b"dest=", b"output=")
+"""What a file holds that names other files."""
 NOWHERE = "NUL"
 CALIBRATED_AT = (1.0,)
 """Demands of the runs that a calibration is made from: the scenario's own."""
@@ -150,8 +152,12 @@ class _Copies:
 
     def _mend(self, original: Path, target: Path) -> None:
         with gzip.open(original) if original.suffix == ".gz" else original.open("rb") as file:
+            # Route files may be large: only what may need it is read as a whole.
+            if not any(word in line for line in file for word in SIGNS):
+                shutil.copyfile(original, target)
+                return
+            file.seek(0)
             tree = ElementTree.parse(file, forbid_dtd=True)
-        changed = False
         for element in tree.iter():
             written = WRITES.get(element.tag, "")
             read = "href" if element.tag == "include" else "file"
@@ -160,34 +166,28 @@ class _Copies:
             elif (original.parent / element.get(read, "")).is_file():
                 inside = original.parent / element.get(read)
                 element.set(read, self.mended(inside) if element.tag == "include" else self.of(inside))
-            else:
-                continue
-            changed = True
-        if not changed:
-            shutil.copyfile(original, target)
-            return
         with gzip.open(target, "wb") if target.suffix == ".gz" else target.open("wb") as file:
             tree.write(file, encoding="utf-8", xml_declaration=True)
 
 
 def _write_scenario(path: Path, chosen: Case, copies: _Copies) -> None:
-    root = ET.Element("configuration")
-
-    def section(name: str, options: Mapping[str, str]) -> None:
-        parent = ET.SubElement(root, name) if options else root
-        for option, value in options.items():
-            ET.SubElement(parent, option, value=value)
-
     read = {"net-file": copies.net}
     if chosen.route_files:
         read["route-files"] = ",".join(copies.mended(each) for each in chosen.route_files)
     if chosen.additional_files:
         read["additional-files"] = ",".join(copies.mended(each) for each in chosen.additional_files)
     read |= {name: ",".join(map(copies.of, files)) for name, files in chosen.further_files.items()}
-    section("input", read)
     ends = {} if chosen.end_s is None else {"end": case.in_digits(chosen.end_s)}
-    section("time", {"begin": case.in_digits(chosen.begin_s), **ends})
-    section("processing", {name: value for name, value in chosen.options if name not in read})
+    sections = {
+        "input": read,
+        "time": {"begin": case.in_digits(chosen.begin_s), **ends},
+        "processing": {name: value for name, value in chosen.options if name not in read},
+    }
+    root = ET.Element("configuration")
+    for name, options in sections.items():
+        section = ET.SubElement(root, name)
+        for option, value in options.items():
+            ET.SubElement(section, option, value=value)
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
 

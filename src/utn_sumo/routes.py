@@ -125,6 +125,7 @@ class _Reader:
     def __init__(self, case: Case):
         self.begin_s = case.begin_s
         self.end_s = math.inf if case.end_s is None else case.end_s
+        self.scale = case.scale
         self.path = case.file
         self.ways: dict[str, Shares[_Way]] = {}
         self.kinds: dict[str, Shares[_Kind]] = {
@@ -173,7 +174,7 @@ class _Reader:
 
     def _ride(self, element: Element) -> None:
         """Count a vehicle, a trip or a flow by as many as depart within the window."""
-        veh = self._flow_veh(element) if element.tag == "flow" else float(self._departs(element))
+        veh = self.scale * (self._flow_veh(element) if element.tag == "flow" else self._departs(element))
         if not veh:
             return
         who = self._name(element)

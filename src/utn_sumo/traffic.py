@@ -42,7 +42,7 @@ def given(scenario: Scenario) -> Case:
         end_s = wished_s if end_s is None else min(end_s, wished_s)
     options = dict(found.options)
     if scenario.demand != 1:
-        options["scale"] = f"{scenario.demand * float(options.get('scale', '1')):g}"
+        options["scale"] = f"{scenario.demand * found.scale:g}"
     chosen = replace(found, end_s=end_s, options=tuple(options.items()))
     routes.check(chosen, routes.read(chosen))
     return chosen

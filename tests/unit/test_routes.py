@@ -137,6 +137,15 @@ def test_departures_outside_the_window_weigh_nothing(content: str, tmp_path: Pat
     assert found.space_m == 7.5
 
 
+def test_what_sumo_scales_is_scaled(tmp_path: Path) -> None:
+    (tmp_path / "a.rou.xml").write_text(
+        f'<routes><vehicle id="v" depart="1">{OWN}</vehicle></routes>', encoding="utf-8"
+    )
+    options = (("scale", "2.5"),)
+    found = routes.read(Case(tmp_path, tmp_path, (tmp_path / "a.rou.xml",), (), 0.0, None, 300.0, options))
+    assert found.turned_veh["a", "b"] == found.by_class_veh["passenger"] == 2.5
+
+
 def test_those_whose_way_sumo_finds_are_counted_apart(tmp_path: Path) -> None:
     found = traffic(
         tmp_path,
