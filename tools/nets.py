@@ -82,7 +82,7 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
                     stages=tuple(range(first_stage, len(stages))),
                     cycle_s=CYCLE_S,
                     offset_s=0.0,
-                    signal_turn=tuple(range(first_turn, len(turns))),
+                    signal_turns=tuple((turn,) for turn in range(first_turn, len(turns))),
                     conflicts=tuple(tuple(a // 2 != b // 2 for b in range(count)) for a in range(count)),
                 )
             )

@@ -31,6 +31,7 @@ from utn_sumo import (
 from utn_sumo.case import SUFFIX, Case
 from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
+from utn_sumo.errors import SettingError
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.sumo import SumoPlant
 from utn_sumo.plant.untouched import Look
@@ -92,7 +93,7 @@ def run(
     ):
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
-        recorder = recording.Recorder(folder, {"scenario": scenario.model_dump(), "versions": _versions(plant.version)})
+        recorder = recording.Recorder(folder, _settings(scenario, chosen, plant.version))
         state = estimator.initial()
         try:
             for step in range(steps):
@@ -157,7 +158,14 @@ def _progress(time_s: float, duration_s: float, seen: Look) -> Progress:
 
 
 def controllable(chosen: Case) -> Network:
-    """A net as other people have it, with the signals left alone whose own stages can't be shown safely."""
+    """A net as other people have it, with the signals left alone whose own stages can't be shown safely.
+
+    Raises SettingError for a mesoscopic case, where there are no lanes to watch.
+    """
+    if dict(chosen.options).get("mesosim", "false") == "true":
+        raise SettingError(
+            f"scenario {str(chosen.file)!r} has mesosim, which knows no lanes: leave it out, or use --controller native"
+        )
     name, additional, coming = str(chosen.net_file), chosen.additional_files, routes.read(chosen)
     net = network.load(name, None, additional, coming)
     refused = signals.refused(net)
@@ -232,6 +240,11 @@ def _default_name(scenario: Scenario) -> str:
         Path(part.partition(":")[0]).name.partition(".")[0] for part in (scenario.net, scenario.controller)
     )
     return f"{net}-{controller}-demand{scenario.demand:g}-seed{scenario.seed}"
+
+
+def _settings(scenario: Scenario, chosen: Case | None, sumo: str) -> dict[str, Any]:
+    brought = {} if chosen is None else {"case": chosen.record()}
+    return {"scenario": scenario.model_dump(), **brought, "versions": _versions(sumo)}
 
 
 def _versions(sumo: str) -> dict[str, str]:

@@ -23,7 +23,7 @@ DEFAULT_TELEPORT_S = 300.0
 ABOUT_OUTPUT = frozenset({"output", "report", "gui_only"})
 """Sections of a configuration that say what SUMO writes and shows."""
 SHOWN = frozenset({"log", "error-log", "message-log", "no-step-log", "no-warnings", "verbose", "gui-settings-file"})
-"""Options that say so wherever they stand: SUMO takes no notice of sections."""
+"""Options that say so wherever they stand, as all with `output` in their names do: SUMO does not look at sections."""
 OURS = frozenset({"net-file", "route-files", "additional-files", "begin", "end", "seed", "random"})
 """Options that the fields of a `Case` stand for, and the seed."""
 FILES = ("weight-files", "load-state")
@@ -54,6 +54,11 @@ class Case:
     def step_s(self) -> float:
         """Length of SUMO's steps."""
         return seconds(dict(self.options).get("step-length", "1"))
+
+    @property
+    def scale(self) -> float:
+        """How many of each of its vehicles drive."""
+        return float(dict(self.options).get("scale", "1"))
 
     @property
     def further_files(self) -> dict[str, tuple[Path, ...]]:
@@ -118,7 +123,7 @@ def read(path: Path) -> Case:
     for section in elements(path, "scenario", "give a .sumocfg"):
         for option in [section, *section]:
             name, value = LONG.get(option.tag, option.tag), option.get("value", option.get("v"))
-            if value is not None and not (section.tag in ABOUT_OUTPUT or name in SHOWN or "-output" in name):
+            if value is not None and not (section.tag in ABOUT_OUTPUT or name in SHOWN or "output" in name):
                 said[name] = value
     if "net-file" not in said:
         raise SettingError(f"scenario {str(path)!r} names no net-file: give a whole .sumocfg")
@@ -131,6 +136,8 @@ def read(path: Path) -> Case:
     end_s = _seconds(path, "end", said["end"]) if "end" in said else -1.0
     if not _seconds(path, "step-length", said.get("step-length", "1")) > 0:
         raise SettingError(f"scenario {str(path)!r}: step-length is {said['step-length']!r}: make it more than 0 s")
+    if not _is_number(said.get("scale", "1")):
+        raise SettingError(f"scenario {str(path)!r}: scale is {said['scale']!r}: give a number from 0 on")
     return Case(
         file=path,
         net_file=found["net-file"][0],
@@ -155,7 +162,7 @@ def elements(
     from defusedxml import ElementTree  # noqa: PLC0415
     from defusedxml.common import DefusedXmlException  # noqa: PLC0415
 
-    if path in within:
+    if path.resolve() in within:
         raise SettingError(f"{name} {str(path)!r} includes itself: {remedy}")
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
@@ -167,11 +174,11 @@ def elements(
                 above.pop()
                 if element.tag == "include":
                     included = path.parent / element.get("href", "")
-                    yield from elements(included, name, remedy, (*within, path))
+                    yield from elements(included, name, remedy, (*within, path.resolve()))
                 elif len(above) == 1:
                     yield element
                     above[0].clear()
-    except (OSError, EOFError, zlib.error, ElementTree.ParseError, DefusedXmlException, LookupError) as error:
+    except (OSError, EOFError, zlib.error, ElementTree.ParseError, DefusedXmlException, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise SettingError(f"{name} {str(path)!r} can't be read ({reason}): {remedy}") from error
 
@@ -203,6 +210,13 @@ def _seconds(path: Path, name: str, text: str) -> float:
         return seconds(text)
     except ValueError as error:
         raise SettingError(f"scenario {str(path)!r}: {name} is {text!r}, which is no time in seconds") from error
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return 0 <= float(text) < math.inf
+    except ValueError:
+        return False
 
 
 def _files(path: Path, name: str, text: str) -> tuple[Path, ...]:

@@ -216,6 +216,28 @@ def inspect(net: str, out: Path | None, as_json: bool) -> None:
     click.echo(json.dumps(recording.plain(result))) if as_json else report.inspection_table(result, folder)
 
 
+@cli.command("import")
+@click.argument("case", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder to write; must be new or empty.")
+@click.option(
+    "--calibrate", "calibrated", is_flag=True, help="Fit the model to runs of CASE too: minutes, not seconds."
+)
+@click.option("--seeds", default="201,202", show_default=True, help="Seeds of those runs, separated by commas.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
+def import_(case: Path, out: Path, calibrated: bool, seeds: str, as_json: bool) -> None:
+    """Make of CASE, a .sumocfg, a folder that is complete in itself, with what the bench makes of net and traffic."""
+    from utn_sumo import importing, recording, report  # noqa: PLC0415 - heavy
+
+    seed_list = [int(seed) for seed in _numbers("seeds", seeds)]
+    found = importing.read(case)
+    folder = recording.new_folder(out, "import")
+    result = importing.write(found, folder)
+    if calibrated:
+        with report.counter("runs", len(seed_list)) as tick:
+            result["calibration"] = str(importing.calibrate(folder, seed_list, tick))
+    click.echo(json.dumps(recording.plain(result))) if as_json else report.import_table(result)
+
+
 @cli.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 def replay(folder: Path) -> None:

@@ -107,8 +107,8 @@ class Junction:
     stages: tuple[int, ...]
     cycle_s: float
     offset_s: float
-    signal_turn: tuple[int, ...]
-    """Turn of each signal letter, -1 where the letter serves none that we model."""
+    signal_turns: tuple[tuple[int, ...], ...]
+    """Turns of each signal letter: none where it stops no motor traffic, several where streams share it."""
     conflicts: tuple[tuple[bool, ...], ...]
     """conflicts[a][b]: the streams of letters a and b cross, or come from two roads into one lane."""
     without_yellow: tuple[int, ...] = ()
@@ -186,7 +186,7 @@ class Network:
         """(M,) turns that no signal stops."""
         free = np.ones(len(self.turns), dtype=np.bool_)
         for junction in self.junctions:
-            free[[turn for turn in junction.signal_turn if turn >= 0]] = False
+            free[[turn for turns in junction.signal_turns for turn in turns]] = False
         return free
 
     @cached_property
@@ -394,7 +394,7 @@ class Network:
                 replace(
                     whole,
                     stages=tuple(stage_place[stage] for stage in whole.stages),
-                    signal_turn=tuple(turn_place.get(turn, -1) for turn in whole.signal_turn),
+                    signal_turns=tuple(tuple(turn_place[turn] for turn in turns) for turns in whole.signal_turns),
                 )
                 for whole in (self.junctions[index] for index in junctions)
             ),

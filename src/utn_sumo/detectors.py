@@ -48,22 +48,27 @@ def ids(network: Network) -> DetectorIds:
     """The ids under which `write` puts the detectors of `network` into a file."""
 
     def on(kind: str, edge: str) -> tuple[str, ...]:
-        return tuple(f"{kind}_{edge}_{lane}" for lane in network.edge_lanes[edge])
+        return tuple(_named(kind, f"{edge}_{lane}") for lane in network.edge_lanes[edge])
 
     return DetectorIds(
         entry=tuple(on("entry", link.edges[0]) for link in network.links),
         stop_line=tuple(on("stop", link.edges[-1]) for link in network.links),
-        turn=tuple(tuple(f"turn_{lane}" for lane in turn.via_lanes) for turn in network.turns),
+        turn=tuple(tuple(_named("turn", lane) for lane in turn.via_lanes) for turn in network.turns),
         area=tuple(
             tuple(name for edge, _ in _watched(network, link) for name in on("area", edge)) for link in network.links
         ),
         group=tuple(
-            tuple(f"area_{network.links[group.link].edges[-1]}_{lane}" for lane in group.lanes)
+            tuple(_named("area", f"{network.links[group.link].edges[-1]}_{lane}") for lane in group.lanes)
             for group in network.groups
         ),
-        joining=tuple(tuple(f"side_{lane}" for lane in link.joining) for link in network.links),
-        parting=tuple(tuple(f"side_{lane}" for lane in link.parting) for link in network.links),
+        joining=tuple(tuple(_named("side", lane) for lane in link.joining) for link in network.links),
+        parting=tuple(tuple(_named("side", lane) for lane in link.parting) for link in network.links),
     )
+
+
+def _named(kind: str, lane: str) -> str:
+    """The id of a detector: none that other people's files have."""
+    return f"utn_{kind}_{lane}"
 
 
 def _watched(network: Network, link: Link) -> list[tuple[str, float]]:
@@ -89,12 +94,12 @@ def write(network: Network, path: Path, period_s: float) -> None:
     for link in network.links:
         for kind, edge, position_m in (("entry", link.edges[0], ENTRY_M), ("stop", link.edges[-1], STOP_LINE_M)):
             for lane in network.edge_lanes[edge]:
-                loop(f"{kind}_{edge}_{lane}", f"{edge}_{lane}", position_m)
+                loop(_named(kind, f"{edge}_{lane}"), f"{edge}_{lane}", position_m)
         for watched, seen_m in _watched(network, link):
             length_m = network.edge_length_m[watched]
             for lane in network.edge_lanes[watched]:
                 place = {
-                    "id": f"area_{watched}_{lane}",
+                    "id": _named("area", f"{watched}_{lane}"),
                     "lane": f"{watched}_{lane}",
                     "pos": f"{length_m - seen_m:g}",
                     "endPos": f"{length_m:g}",
@@ -102,10 +107,10 @@ def write(network: Network, path: Path, period_s: float) -> None:
                 ET.SubElement(root, "laneAreaDetector", {**place, **report})
     for turn in network.turns:
         for via in turn.via_lanes:
-            loop(f"turn_{via}", via, TURN_M)
+            loop(_named("turn", via), via, TURN_M)
     # One link's traffic may part onto another's: one loop then counts for both.
     for via in sorted({via for link in network.links for via in (*link.joining, *link.parting)}):
-        loop(f"side_{via}", via, TURN_M)
+        loop(_named("side", via), via, TURN_M)
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
 

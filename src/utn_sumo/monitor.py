@@ -127,6 +127,9 @@ class _Guard:
         self.rules = _Rules.of(network, junction)
         self.under_way = (junction.offset_s - begin_s) % junction.cycle_s > 0
         """Whether a cycle is under way when the run begins: how long its green has lasted nobody saw."""
+        last = network.stages[junction.stages[-1]]
+        self.ends = last.clearance[-1][0] if last.clearance else last.state
+        """What a cycle ends with: nor did anybody see how long a green has lasted that goes on round it."""
         size = len(junction.conflicts)
         self.foes = [[b for b in range(size) if junction.conflicts[a][b]] for a in range(size)]
         self.green_since = [0] * size
@@ -164,7 +167,8 @@ class _Guard:
         """What is wrong with one signal's change at this second; empty if nothing is."""
         rules = self.rules
         if now in GREEN and was not in GREEN:
-            self.green_since[signal] = LONG_AGO_S if second == 0 and self.under_way else second
+            lasts = self.under_way or self.ends[signal] in GREEN
+            self.green_since[signal] = LONG_AGO_S if second == 0 and lasts else second
             for foe in self.foes[signal]:
                 since_s = second - self.last_green[foe] - 1
                 if now == "G" and state[foe] not in GREEN and since_s < rules.between_s[foe][signal]:

@@ -34,16 +34,7 @@ def run(
     folder = recording.new_folder(folder, f"{Path(scenario.net).name.partition('.')[0]}-{NAME}-seed{scenario.seed}")
     recording.write_json(
         folder / recording.SETTINGS,
-        {
-            "scenario": scenario.model_dump(),
-            "case": {
-                "net_file": str(chosen.net_file),
-                "begin_s": chosen.begin_s,
-                "end_s": chosen.end_s,
-                "teleport_s": chosen.teleport_s,
-                "options": dict(chosen.options),
-            },
-        },
+        {"scenario": scenario.model_dump(), "case": chosen.record()},
     )
     outputs = folder / "outputs.add.xml"
     write_outputs(outputs)

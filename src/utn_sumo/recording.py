@@ -155,9 +155,9 @@ class Log:
 
     @classmethod
     def stack(cls, logs: Sequence[Log]) -> Log:
-        """Several runs of the same length as one log."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(**{name: np.concatenate([getattr(log, name) for log in logs], axis=1) for name in names})
+        """Several runs as one log, as long as the shortest of them."""
+        names, steps = [field.name for field in dataclasses.fields(cls)], min(len(log.x_veh) for log in logs)
+        return cls(**{name: np.concatenate([getattr(log, name)[:steps] for log in logs], axis=1) for name in names})
 
 
 def read_log(folder: Path) -> Log:

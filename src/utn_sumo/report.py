@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from utn_sumo import recording
 from utn_sumo.bridge import Progress as RunProgress
 from utn_sumo.scenario import Scenario
 
@@ -89,11 +91,48 @@ def table(result: dict[str, Any]) -> None:
     for key, label, unit, pattern in ROWS:
         view.add_row(label, "not known" if result[key] is None else pattern.format(result[key]), unit)
     console.print(view)
+    brought = recording.read_json(Path(result["out"]), recording.SETTINGS).get("case")
+    if brought is not None:
+        console.print(_window(brought), highlight=False)
     for reason in [*result.get("unsafe_reasons", []), *result.get("fallback_reasons", [])]:
         console.print(f"  ! {reason}", markup=False)
     if result["interrupted"]:
         console.print("stopped before its end: the measures cover the time that was run")
     console.print(f"results: {result['out']}", markup=False)
+
+
+def _window(brought: dict[str, Any]) -> str:
+    """What a .sumocfg says of times, in a line."""
+    end_s, teleport_s = brought["end_s"], brought["teleport_s"]
+    return (
+        f"from {brought['begin_s']:.12g} s {'until the roads are empty' if end_s is None else f'to {end_s:.12g} s'}, "
+        f"step {brought['step_s']:g} s, teleport {f'after {teleport_s:g} s' if teleport_s > 0 else 'never'}"
+    )
+
+
+def import_table(result: dict[str, Any]) -> None:
+    """What has been imported, and how to run it."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    without_veh = result["without_route_veh"]
+    rows = {
+        "window": _window(result),
+        "at its begin": "the roads are empty: they have to fill first" if result["empty_at_begin"] else "a saved state",
+        "signals controlled": f"{len(result['controlled'])}: {', '.join(result['controlled'])}",
+        **{f"left alone: {signal}": reason for signal, reason in result["left_alone"].items()},
+        "links, stages": f"{result['links']}, {result['stages']}; a plan every {result['control_step_s']:g} s",
+        "vehicles": ", ".join(f"{veh:.0f} {vclass}" for vclass, veh in result["by_class_veh"].items()) or "none",
+        "room of a vehicle": f"{result['space_m']:.2f} m with its gap",
+        "without a route": f"{without_veh:.0f}: taken to go the fastest way on empty roads" if without_veh else "none",
+        "turning fractions": f"in {Path(result['turns']).name}",
+        "calibration": Path(result["calibration"]).name if result["calibration"] else "none: utn import --calibrate",
+    }
+    view = Table(title=escape(result["scenario"]), title_justify="left", show_header=False)
+    view.add_column()
+    view.add_column(overflow="fold")
+    for label, value in rows.items():
+        view.add_row(escape(label), escape(value))
+    console.print(view)
+    console.print(f"run it with  utn run {result['scenario']}", markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element
 from utn_sumo import case as cases
 from utn_sumo.case import Case
 from utn_sumo.errors import SettingError
-from utn_sumo.network import Traffic
+from utn_sumo.network import MOTOR, Traffic
 
 LENGTH_AND_GAP_M = {
     "pedestrian": (0.215, 0.25),
@@ -60,6 +60,8 @@ DAY_S = 86400.0
 """How long SUMO lets a flow last that has no end, where the window has none either."""
 WHENEVER = frozenset({"triggered", "containerTriggered", "split", "begin", "now"})
 """Departures that are no time: they are taken to be within the window."""
+ROUNDING_VEH = 1e-6
+"""What the times of a flow's departures are uncertain by, in vehicles."""
 DRIVES, WAYS = frozenset({"vehicle", "trip", "flow"}), frozenset({"route", "routeDistribution"})
 
 
@@ -107,6 +109,7 @@ class _Reader:
     def __init__(self, case: Case):
         self.begin_s = case.begin_s
         self.end_s = math.inf if case.end_s is None else case.end_s
+        self.scale = case.scale
         self.path = case.file
         self.ways: dict[str, Shares[_Way]] = {}
         self.kinds: dict[str, Shares[_Kind]] = {
@@ -143,8 +146,9 @@ class _Reader:
         for name, (veh, who) in self.by_type.items():
             for kind, share in _known(self.kinds, name, who):
                 by_class_veh[kind.vclass] += veh * share
-                space_veh_m += veh * share * kind.space_m
-        total_veh = sum(by_class_veh.values())
+                if kind.vclass in MOTOR:
+                    space_veh_m += veh * share * kind.space_m
+        total_veh = sum(veh for vclass, veh in by_class_veh.items() if vclass in MOTOR)
         return Traffic(
             turned_veh=dict(self.turned_veh),
             space_m=space_veh_m / total_veh if total_veh else sum(CAR_M),
@@ -155,7 +159,7 @@ class _Reader:
 
     def _ride(self, element: Element) -> None:
         """Count a vehicle, a trip or a flow by as many as depart within the window."""
-        veh = self._flow_veh(element) if element.tag == "flow" else float(self._departs(element))
+        veh = self.scale * (self._flow_veh(element) if element.tag == "flow" else self._departs(element))
         if not veh:
             return
         who = self._name(element)
@@ -189,7 +193,7 @@ class _Reader:
         return self.begin_s <= self._time_s(element, "depart", None) < self.end_s
 
     def _flow_veh(self, element: Element) -> float:
-        """Vehicles of a flow that depart within the window, on average where they depart by chance."""
+        """Vehicles of a flow that depart within the window: on average, where they depart by chance."""
         begin_s = self._time_s(element, "begin", self.begin_s)
         # As SUMO has it: without an end of its own a flow lasts as long as the window, or a day.
         end_s = self._time_s(element, "end", self.end_s if self.end_s < math.inf else begin_s + DAY_S)
@@ -203,7 +207,14 @@ class _Reader:
             rate_veh_s = number / (end_s - begin_s)
         elif number is not None:
             end_s = begin_s + number / rate_veh_s
-        return rate_veh_s * max(0.0, min(end_s, self.end_s) - max(begin_s, self.begin_s))
+        by_chance = "probability" in element.attrib or element.get("period", "").startswith("exp")
+
+        def until_veh(time_s: float) -> float:
+            """Vehicles that depart before a time; those at even distances do so at its start."""
+            veh = rate_veh_s * max(0.0, min(time_s, end_s) - begin_s)
+            return veh if by_chance else math.ceil(veh - ROUNDING_VEH)
+
+        return max(0.0, until_veh(self.end_s) - until_veh(self.begin_s))
 
     def _rate_veh_s(self, element: Element) -> float | None:
         """Vehicles a second, if the flow says so in any of SUMO's ways."""

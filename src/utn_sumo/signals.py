@@ -88,8 +88,8 @@ def check_programme(network: Network, junction: int, phases: list[tuple[str, flo
     for state, duration in phases:
         if duration < 1 or duration != round(duration):
             raise PlanError(f"junction {item.id}: phase of {duration:g} s, whole seconds from 1 on are needed")
-        if len(state) != len(item.signal_turn):
-            raise PlanError(f"junction {item.id}: {len(state)} letters for {len(item.signal_turn)} signals")
+        if len(state) != len(item.signal_turns):
+            raise PlanError(f"junction {item.id}: {len(state)} letters for {len(item.signal_turns)} signals")
     states = [state for state, _ in phases]
     before = states[-1]
     protected = [False] * len(before)

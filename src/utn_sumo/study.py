@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from utn_sumo import bridge, calibration, floor, forecast_report, mismatch, network, plots, recording
+from utn_sumo import bridge, calibration, case, floor, forecast_report, mismatch, network, plots, recording
+from utn_sumo.contract import Network
 from utn_sumo.errors import SettingError
 from utn_sumo.model import check_step
 from utn_sumo.recording import Log
@@ -124,8 +125,11 @@ def study_calibration(
     step_s: float,
     tick: Callable[[], None],
 ) -> dict[str, Any]:
-    """Record runs and fit the model with a step of `step_s` to them: the content of a calibration file."""
-    whole = network.load(base["net"])
+    """Record runs and fit the model with a step of `step_s` to them: the content of a calibration file.
+
+    The net of `base` may be a .sumocfg, whose traffic `demands` scale.
+    """
+    whole = _plant_network(base["net"])
     check_step(whole, step_s)
     items = [scenario(**base, demand=demand, seed=seed) for demand in demands for seed in seeds]
     log = Log.stack([recording.read_log(path) for path in record(items, folder, tick)])
@@ -137,4 +141,10 @@ def study_calibration(
         "demands": list(demands),
         "seeds": list(seeds),
     }
-    return {"made_from": {**made, "hours": items[0].hours}, **fitted}
+    hours = len(log.x_veh) * whole.control_step_s / 3600
+    return {"made_from": {**made, "hours": hours}, **fitted}
+
+
+def _plant_network(name: str) -> Network:
+    """The network that runs on `name`, a net or a .sumocfg, are of."""
+    return bridge.controllable(case.read(Path(name))) if name.endswith(case.SUFFIX) else network.load(name)

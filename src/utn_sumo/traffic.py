@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from utn_sumo import case, demand
+from utn_sumo import case, demand, routes
 from utn_sumo.case import Case
 from utn_sumo.contract import Network
 from utn_sumo.errors import SettingError
@@ -27,7 +27,10 @@ def drawn(scenario: Scenario, network: Network) -> Path:
 
 
 def given(scenario: Scenario) -> Case:
-    """The case of a .sumocfg; `demand` scales all of its traffic, `hours` is the most of its window that is run."""
+    """The case of a .sumocfg; `demand` scales all of its traffic, `hours` is the most of its window that is run.
+
+    Raises SettingError if it can't be used, or if its vehicles drive where its net has no roads.
+    """
     for name in ("profile", "noise", "disturbance"):
         if name in scenario.model_fields_set:
             value = getattr(scenario, name)
@@ -37,5 +40,9 @@ def given(scenario: Scenario) -> Case:
     if "hours" in scenario.model_fields_set:
         wished_s = found.begin_s + scenario.duration_s
         end_s = wished_s if end_s is None else min(end_s, wished_s)
-    options = found.options if scenario.demand == 1 else (*found.options, ("scale", f"{scenario.demand:g}"))
-    return replace(found, end_s=end_s, options=options)
+    options = dict(found.options)
+    if scenario.demand != 1:
+        options["scale"] = f"{scenario.demand * found.scale:g}"
+    chosen = replace(found, end_s=end_s, options=tuple(options.items()))
+    routes.check(chosen, routes.read(chosen))
+    return chosen

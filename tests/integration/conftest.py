@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import pytest
 
-from utn_sumo import bridge
+from utn_sumo import bridge, demand
+from utn_sumo.contract import Network
 from utn_sumo.scenario import scenario
 
 
@@ -32,3 +34,26 @@ def run_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[dict
         return made[key]
 
     return run
+
+
+@pytest.fixture
+def town(utn17: Network, tmp_path: Path) -> Path:
+    """A .sumocfg of a quarter of an hour that begins at six, asks for outputs of its own and has an unusual option."""
+    drawn = demand.route_file(
+        utn17, profile="constant", duration_s=900, step_s=120, scale=0.8, noise=0.0, seed=4, cache=tmp_path / "cache"
+    )
+    tree = ET.parse(drawn)
+    for vehicle in tree.getroot():
+        vehicle.set("depart", f"{21600 + float(vehicle.attrib['depart']):.2f}")
+    tree.write(tmp_path / "town.rou.xml")
+    file = tmp_path / "town.sumocfg"
+    file.write_text(
+        f"""<configuration>
+        <input><net-file value="{utn17.net_file}"/><route-files value="town.rou.xml"/></input>
+        <time><begin value="6:00:00"/><end value="22500"/><step-length value="0.5"/></time>
+        <processing><time-to-teleport value="120"/></processing>
+        <output><tripinfo-output value="theirs.xml"/></output>
+        </configuration>""",
+        encoding="utf-8",
+    )
+    return file

@@ -398,12 +398,13 @@ def several_programmes(folder: Path) -> Path:
 
 
 def programmes_by_the_clock(folder: Path) -> Path:
-    """A WAUT that changes to the longer programme at 120 s and back at 240 s."""
+    """A WAUT that changes to C's longer programme at 120 s and back at 240 s; D as usual."""
     longer = ((45, NORTH_SOUTH), *TWO_STAGES[1:])
-    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", longer, "long"), tl_logic("C", TWO_STAGES, "short"))
+    logics = (tl_logic("C", longer, "long"), tl_logic("C", TWO_STAGES, "short"), tl_logic("D", TWO_STAGES))
+    retime(row("CD").net(folder, NO_TURNAROUNDS), *logics)
     switches = "".join(f'<wautSwitch time="{time}" to="{name}"/>' for time, name in ((120, "long"), (240, "short")))
     waut = f'<WAUT refTime="0" id="clock" startProg="short">{switches}</WAUT>'
-    return case(folder, traffic("C"), waut + '<wautJunction wautID="clock" junctionID="C"/>')
+    return case(folder, traffic("CD"), waut + '<wautJunction wautID="clock" junctionID="C"/>')
 
 
 def phases_that_are_skipped(folder: Path) -> Path:

@@ -11,37 +11,14 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from utn_sumo import bridge, case, demand, forecast_report, replay
+from utn_sumo import bridge, case, forecast_report, replay, traffic
 from utn_sumo.cli import cli
 from utn_sumo.contract import Network
-from utn_sumo.errors import PlantError, ResultError, SettingError
+from utn_sumo.errors import ResultError, SettingError
 from utn_sumo.scenario import scenario
 from utn_sumo.sumo_tools import sumo_binary
 
 SCENARIOS = Path(__file__).parents[3] / "shared" / "scenarios"
-
-
-@pytest.fixture
-def town(utn17: Network, tmp_path: Path) -> Path:
-    """A .sumocfg of a quarter of an hour that begins at six, asks for outputs of its own and has an unusual option."""
-    drawn = demand.route_file(
-        utn17, profile="constant", duration_s=900, step_s=120, scale=0.8, noise=0.0, seed=4, cache=tmp_path / "cache"
-    )
-    tree = ET.parse(drawn)
-    for vehicle in tree.getroot():
-        vehicle.set("depart", f"{21600 + float(vehicle.attrib['depart']):.2f}")
-    tree.write(tmp_path / "town.rou.xml")
-    file = tmp_path / "town.sumocfg"
-    file.write_text(
-        f"""<configuration>
-        <input><net-file value="{utn17.net_file}"/><route-files value="town.rou.xml"/></input>
-        <time><begin value="6:00:00"/><end value="22500"/><step-length value="0.5"/></time>
-        <processing><time-to-teleport value="120"/></processing>
-        <output><tripinfo-output value="theirs.xml"/></output>
-        </configuration>""",
-        encoding="utf-8",
-    )
-    return file
 
 
 def trips(path: Path) -> dict[str, tuple[str, ...]]:
@@ -141,9 +118,10 @@ def test_files_of_a_scenario_are_looked_at_before_sumo_reads_them(town: Path, ro
 def test_routes_of_another_net_are_refused_in_one_line(town: Path, tmp_path: Path) -> None:
     lost = '<routes><vehicle id="a" depart="21600"><route edges="nowhere"/></vehicle></routes>'
     town.with_name("town.rou.xml").write_text(lost, encoding="utf-8")
-    with pytest.raises(PlantError, match="nowhere") as caught:
+    with pytest.raises(SettingError, match=r"vehicle 'a' .* edge 'nowhere', .*: give routes of that net") as caught:
         bridge.run(scenario(net=str(town), controller="native"), tmp_path / "run")
     assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -216,18 +194,86 @@ def test_a_junction_whose_own_stages_conflict_is_left_alone_and_named(town: Path
     assert (result["unsafe_signal_s"], result["fallbacks"]) == (0, 0)
 
 
-def test_its_runs_are_not_replayed_and_their_forecasts_not_judged(town: Path, tmp_path: Path) -> None:
-    bridge.run(scenario(net=str(town), controller="fixed"), tmp_path / "run")
-    with pytest.raises(ResultError, match="no routes"):
+CLASH = [(60, "GGGGGG"), (3, "yyyyyy"), (50, "rrrGGG"), (7, "rrryyy")]
+
+
+@pytest.mark.parametrize("stopped_after", [None, 4], ids=["whole", "stopped early"])
+@pytest.mark.parametrize("controller", ["native", "fixed"])
+def test_bare_sumo_replays_its_runs_vehicle_for_vehicle(
+    town: Path, tmp_path: Path, controller: str, stopped_after: int | None
+) -> None:
+    # J2 can't be controlled: its own programme goes on beside what is replayed.
+    phases = "".join(f'<phase duration="{lasts}" state="{state}"/>' for lasts, state in CLASH)
+    added = f'<additional><tlLogic id="J2" programID="b" type="static" offset="0">{phases}</tlLogic></additional>'
+    town.with_name("own.add.xml").write_text(added, encoding="utf-8")
+    text = town.read_text(encoding="utf-8").replace("</input>", '<additional-files value="own.add.xml"/></input>')
+    town.write_text(text, encoding="utf-8")
+
+    def stop(progress: bridge.Progress) -> None:
+        if stopped_after and progress.time_s >= 120 * stopped_after:
+            raise KeyboardInterrupt
+
+    result = bridge.run(scenario(net=str(town), controller=controller, demand=0.9), tmp_path / "run", stop)
+    assert result["interrupted"] is bool(stopped_after)
+    configuration = replay.write(tmp_path / "run")
+    subprocess.run([sumo_binary("sumo"), "-c", str(configuration)], check=True, capture_output=True)
+    recorded = trips(tmp_path / "run" / "trips.xml")
+    assert len(recorded) > 300
+    assert trips(configuration.with_name("trips.xml")) == recorded
+    text = configuration.with_name("signals.add.xml").read_text(encoding="utf-8")
+    assert ('"J1"' in text, '"J2"' in text) == (controller == "fixed", False)
+
+
+@pytest.mark.parametrize(("change", "says"), [("move", "is gone from there"), ("edit", "has changed since")])
+def test_a_run_whose_files_are_not_what_they_were_is_not_replayed(
+    town: Path, tmp_path: Path, change: str, says: str
+) -> None:
+    bridge.run(scenario(net=str(town), controller="native", hours=0.05), tmp_path / "run")
+    routes = town.with_name("town.rou.xml")
+    if change == "move":
+        routes.rename(town.with_name("moved.rou.xml"))
+    else:
+        routes.write_text("<routes/>", encoding="utf-8")
+    with pytest.raises(ResultError, match=f"town.rou.xml.*{says}"):
         replay.write(tmp_path / "run")
+    assert not (tmp_path / "run" / "replay").exists()
+
+
+def test_forecasts_of_its_runs_are_not_judged(town: Path, tmp_path: Path) -> None:
+    bridge.run(scenario(net=str(town), controller="fixed", hours=0.1), tmp_path / "run")
     with pytest.raises(SettingError, match="drawn"):
         forecast_report.rmse_veh_h(tmp_path / "run", 7, 15)
+
+
+@pytest.mark.parametrize("controller", ["native", "fixed"])
+def test_settings_of_a_run_tell_its_window_its_options_and_its_files(
+    town: Path, tmp_path: Path, controller: str
+) -> None:
+    bridge.run(scenario(net=str(town), controller=controller, hours=0.1), tmp_path / "run")
+    kept = json.loads((tmp_path / "run" / "settings.json").read_text(encoding="utf-8"))["case"]
+    assert (kept["begin_s"], kept["end_s"], kept["step_s"], kept["teleport_s"]) == (21600, 21960, 0.5, 120)
+    assert kept["options"] == {"step-length": "0.5", "time-to-teleport": "120"}
+    assert kept["route_files"] == [str(town.with_name("town.rou.xml"))]
+
+
+def test_demand_scales_on_top_of_a_scale_of_its_own(town: Path, tmp_path: Path) -> None:
+    text = town.read_text(encoding="utf-8").replace("</processing>", '<scale value="0.5"/></processing>')
+    town.write_text(text, encoding="utf-8")
+    chosen = scenario(net=str(town), controller="native", demand=0.5)
+    assert dict(traffic.given(chosen).options)["scale"] == "0.25"
+
+
+def test_what_it_says_of_outputs_is_left_out_in_whatever_section_it_stands(town: Path) -> None:
+    more = '<no-warnings value="true"/><fcd-output value="big.xml"/><fcd-output.geo value="true"/></processing>'
+    town.write_text(town.read_text(encoding="utf-8").replace("</processing>", more), encoding="utf-8")
+    assert dict(case.read(town).options) == {"step-length": "0.5", "time-to-teleport": "120"}
 
 
 def test_the_command_takes_it_by_its_name_and_inspect_shows_its_net(town: Path, tmp_path: Path) -> None:
     run = CliRunner().invoke(cli, ["run", str(town), "--controller", "native", "--out", str(tmp_path / "a")])
     assert run.exit_code == 0
     assert "not known" in run.stdout
+    assert "from 21600 s to 22500 s, step 0.5 s, teleport after 120 s" in run.stdout
     shown = CliRunner().invoke(cli, ["inspect", str(town), "--out", str(tmp_path / "b"), "--json"])
     assert len(json.loads(shown.stdout)["links"]) == 17
 

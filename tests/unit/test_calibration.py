@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -87,3 +87,11 @@ def test_a_file_that_does_not_fit_is_refused_in_one_line(utn17: Network, tmp_pat
     with pytest.raises(NetworkError, match="does not fit net 'utn17'") as caught:
         calibration.applied(utn17, path)
     assert "\n" not in str(caught.value)
+
+
+def test_runs_of_unlike_length_are_put_together_as_far_as_the_shortest_goes(utn17: Network) -> None:
+    whole = simulated(utn17, 1)
+    part = replace(whole, **{field.name: getattr(whole, field.name)[:5] for field in fields(whole)})
+    both = Log.stack([whole, part])
+    assert both.x_veh.shape[:2] == (5, 2)
+    assert (both.green_s[:, 0] == both.green_s[:, 1]).all()

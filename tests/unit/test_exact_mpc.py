@@ -146,7 +146,8 @@ def test_smooth_windows_are_the_green_windows(utn17: Network, step_s: float) -> 
         utn17,
         stages=(holding, *(replace(s, turns=tuple(t for t in s.turns if t != 5)) for s in utn17.stages[1:])),
         junctions=tuple(
-            replace(j, signal_turn=tuple(-1 if t == 5 else t for t in j.signal_turn)) for j in shifted.junctions
+            replace(j, signal_turns=tuple(tuple(t for t in turns if t != 5) for turns in j.signal_turns))
+            for j in shifted.junctions
         ),
     )
     rng = np.random.default_rng(8)

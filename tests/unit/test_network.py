@@ -120,14 +120,14 @@ def test_no_stage_opens_two_conflicting_streams(net: Network) -> None:
 def test_conflicts_are_mutual_and_nobody_conflicts_with_itself(net: Network) -> None:
     for junction in net.junctions:
         conflicts = np.array(junction.conflicts)
-        assert conflicts.shape == (len(junction.signal_turn),) * 2
+        assert conflicts.shape == (len(junction.signal_turns),) * 2
         assert (conflicts == conflicts.T).all()
         assert not conflicts.diagonal().any()
 
 
 def test_any_two_links_of_a_junction_have_streams_that_cross(net: Network) -> None:
     for position, junction in enumerate(net.junctions):
-        signal_link = np.array([net.turns[turn].link for turn in junction.signal_turn])
+        signal_link = np.array([net.turns[turn].link for (turn,) in junction.signal_turns])
         conflicts = np.array(junction.conflicts)
         for a, b in combinations(np.flatnonzero(net.link_junction == position), 2):
             assert conflicts[np.ix_(signal_link == a, signal_link == b)].any()
@@ -160,7 +160,9 @@ def test_a_part_keeps_its_links_turns_and_stages_together(net: Network, junction
         assert inside.state == net.stages[outside].state
         assert inside.clearance == net.stages[outside].clearance
         assert names_of_turns(part, inside.turns) == names_of_turns(net, net.stages[outside].turns)
-    assert names_of_turns(part, part.junctions[0].signal_turn) == names_of_turns(net, whole.signal_turn)
+    assert names_of_turns(part, sum(part.junctions[0].signal_turns, ())) == names_of_turns(
+        net, sum(whole.signal_turns, ())
+    )
     assert part.turn_next.tolist() == [EXIT] * len(part.turns)
 
 
@@ -285,7 +287,7 @@ def test_a_net_with_no_signal_to_control_is_refused_with_the_reasons(town: Path,
     dull = [(text, text.splitlines()[0] + '\n<phase duration="90" state="rr"/>\n') for text in texts]
     line = one_line_of(str(edited(town, *dull)))
     assert "no signals that can be controlled" in line
-    assert "J1: no phase" in line
+    assert "J1: its programme has no phase" in line
 
 
 @pytest.mark.parametrize("packed", [False, True])

@@ -22,6 +22,7 @@ MIN_GREEN_S = 10.0
 """Least green of a stage for which the net names none, if it shows the stage as long itself."""
 SHORTEST_STAGE_S = 5.0
 GREEN, YELLOW, OFF = "Gg", "yYu", "oO"
+SWITCHED_OFF = "its programme switches signals off (o, O)"
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,8 @@ class Phase:
     duration_s: float
     least_s: float | None = None
     """`minDur`, where the programme has it."""
+    leads_elsewhere: bool = False
+    """Whether it names its successors (`next`)."""
 
     @property
     def green(self) -> frozenset[int]:
@@ -107,7 +110,12 @@ class Programme:
 
 def _merged(group: Sequence[Phase]) -> Phase:
     least = [phase.least_s for phase in group if phase.least_s is not None]
-    return Phase(group[0].state, sum(phase.duration_s for phase in group), sum(least) if least else None)
+    return Phase(
+        group[0].state,
+        sum(phase.duration_s for phase in group),
+        sum(least) if least else None,
+        any(phase.leads_elsewhere for phase in group),
+    )
 
 
 def _is_remnant(phase: Phase, before: Phase) -> bool:
@@ -123,7 +131,7 @@ def own(tls: Any) -> Programme | None:
     if program is None:
         return None
     phases = (
-        Phase(phase.state, float(phase.duration), float(phase.minDur) if phase.minDur >= 0 else None)
+        Phase(phase.state, float(phase.duration), float(phase.minDur) if phase.minDur >= 0 else None, bool(phase.next))
         for phase in program.getPhases()
     )
     return Programme.of(phases, float(program.getOffset()))
@@ -131,13 +139,11 @@ def own(tls: Any) -> Programme | None:
 
 def added(files: Sequence[Path]) -> dict[str, Programme]:
     """Signal programmes in additional files, by signal: the last one read stands, as in SUMO."""
-    from defusedxml import ElementTree  # noqa: PLC0415
-
     found = {}
     for file in files:
-        with opened(file) as content:
-            logics = [logic for logic in ElementTree.parse(content).iter("tlLogic") if logic.find("phase") is not None]
-        for logic in logics:
+        for logic in _elements(file, "tlLogic"):
+            if logic.find("phase") is None:
+                continue
             try:
                 shown = [_phase(element) for element in logic.iter("phase")]
                 found[logic.get("id")] = Programme.of(shown, float(logic.get("offset", "0")))
@@ -147,6 +153,28 @@ def added(files: Sequence[Path]) -> dict[str, Programme]:
                     f" ({error}): give seconds"
                 ) from error
     return found
+
+
+def switched_elsewhere(files: Sequence[Path]) -> dict[str, str]:
+    """Signals that additional files have SUMO itself switch from programme to programme, or off, and how."""
+    found = {}
+    for file in files:
+        for logic in _elements(file, "tlLogic"):
+            if logic.get("programID") == "off":
+                found[logic.get("id")] = SWITCHED_OFF
+            else:
+                found.pop(logic.get("id"), None)
+    for file in files:
+        for member in _elements(file, "wautJunction"):
+            found[member.get("junctionID")] = "a WAUT switches its programmes by the clock"
+    return found
+
+
+def _elements(file: Path, tag: str) -> list[Any]:
+    from defusedxml import ElementTree  # noqa: PLC0415
+
+    with opened(file) as content:
+        return list(ElementTree.parse(content).iter(tag))
 
 
 def _phase(element: Any) -> Phase:
@@ -160,12 +188,12 @@ def why_left_alone(programme: Programme | None, signals: int) -> str:
         return "it has no signal programme, as rail signals have none"
     states = [phase.state for phase in programme.phases]
     if any(letter in OFF for state in states for letter in state):
-        return "its programme switches signals off (o, O)"
+        return SWITCHED_OFF
+    if any(phase.leads_elsewhere for phase in programme.phases):
+        return "its phases name their successors (next): there is no one cycle"
     stages = len(programme.opens)
-    if stages == 0:
-        return "no phase of its programme shows green without yellow"
-    if stages == 1:
-        return "its programme has one stage: there is nothing to share out"
-    if any(len(state) != len(states[0]) or len(state) < signals for state in states):
-        return f"its programme's states have not a letter for each of its {signals} signals"
-    return ""
+    if stages < 2:  # noqa: PLR2004 - what can be shared out
+        few = "one stage: there is nothing to share out", "no phase that shows green without yellow"
+        return f"its programme has {few[stages == 0]}"
+    uneven = any(len(state) != len(states[0]) or len(state) < signals for state in states)
+    return f"its programme's states have not a letter for each of its {signals} signals" if uneven else ""

@@ -83,9 +83,13 @@ def read(
     if not lights:
         raise NetworkError(f"net {str(path)!r} has no traffic lights: there is nothing to control")
     known = {tls.getID(): programmes.own(tls) for tls in lights} | programmes.added(additional)
+    foreign = programmes.switched_elsewhere(additional)
     walked = crossings(path)
     signals = [Signal(net, tls, known[tls.getID()], walked.get(tls.getID(), [])) for tls in lights]
-    reasons_of = {signal.id: (excluded or {}).get(signal.id) or _why_left_alone(signal) for signal in signals}
+    reasons_of = {
+        signal.id: (excluded or {}).get(signal.id) or foreign.get(signal.id) or _why_left_alone(signal)
+        for signal in signals
+    }
     left_alone = {signal: reason for signal, reason in reasons_of.items() if reason}
     controlled = [signal for signal in signals if signal.id not in left_alone]
     if not controlled:
@@ -156,16 +160,16 @@ class _Reader:
         for position, signal in enumerate(self.signals):
             programme = signal.programme
             assert programme is not None
-            signal_turn = self._signal_turns(signal, turn_index)
+            signal_turns = self._signal_turns(signal, turn_index)
             first = len(stages)
-            stages += [_stage(block, position, signal_turn) for block in programme.blocks]
+            stages += [_stage(block, position, signal_turns) for block in programme.blocks]
             junctions.append(
                 Junction(
                     id=signal.id,
                     stages=tuple(range(first, len(stages))),
                     cycle_s=programme.cycle_s,
                     offset_s=programme.offset_s + programme.begin_s,
-                    signal_turn=tuple(signal_turn),
+                    signal_turns=signal_turns,
                     conflicts=signal.conflicts(),
                     without_yellow=tuple(sorted(set(range(signal.letters)) - signal.of_vehicles)),
                 )
@@ -255,12 +259,14 @@ class _Reader:
         coming = sum(self.coming_veh.get((edge_id, to_edge), 0.0) for to_edge in targets)
         return min(GIVEN_TURNING_VEH, USUAL_TURNING_VEH + coming)
 
-    def _signal_turns(self, signal: Signal, turn_index: Mapping[tuple[int, str], int]) -> list[int]:
-        result = [-1] * signal.letters
-        for connection, index in signal.connections:
-            link = self.link_of.get(connection.getFrom().getID())
-            result[index] = turn_index.get((-1 if link is None else link, connection.getTo().getID()), -1)
-        return result
+    def _signal_turns(self, signal: Signal, turn_index: Mapping[tuple[int, str], int]) -> tuple[tuple[int, ...], ...]:
+        found: list[set[int]] = [set() for _ in range(signal.letters)]
+        for connection, letter in signal.connections:
+            link = self.link_of.get(connection.getFrom().getID(), -1)
+            turn = turn_index.get((link, connection.getTo().getID()))
+            if turn is not None:
+                found[letter].add(turn)
+        return tuple(tuple(sorted(turns)) for turns in found)
 
 
 def _coming_veh(net: Any, traffic: Traffic) -> dict[tuple[str, str], float]:
@@ -271,11 +277,11 @@ def _coming_veh(net: Any, traffic: Traffic) -> dict[tuple[str, str], float]:
     return total
 
 
-def _stage(block: Block, junction: int, signal_turn: Sequence[int]) -> Stage:
+def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]]) -> Stage:
     """A stage of a junction, with the turns that it and each part of its clearance open."""
 
     def served(phase: Phase) -> tuple[int, ...]:
-        return tuple(sorted({signal_turn[signal] for signal in phase.green if signal_turn[signal] >= 0}))
+        return tuple(sorted({turn for signal in phase.green for turn in signal_turns[signal]}))
 
     return Stage(
         junction=junction,

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-MOTOR = ("passenger", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped")
+MOTOR = ("passenger", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped", "emergency")
 """SUMO's vehicle classes that a lane for motor vehicles has one of, at least."""
 TURNAROUND = "t"
 STRAIGHT = "s"

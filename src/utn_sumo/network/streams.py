@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from utn_sumo.network.programmes import Programme
-from utn_sumo.network.roads import for_motors
+from utn_sumo.network.roads import STRAIGHT, for_motors
 from utn_sumo.xml_files import opened
 
 
@@ -35,19 +35,31 @@ class Signal:
         return sorted({each.getFrom().getID() for each in for_motors(connection for connection, _ in self.connections)})
 
     def conflicts(self) -> tuple[tuple[bool, ...], ...]:
-        """Which letters' streams cross, or come from two roads into one lane, by the net's right-of-way matrix."""
+        """Which letters' streams conflict, by the net's right-of-way matrix.
+
+        None do that come from one road into one lane; nor do pedestrians and who turns onto their street, who always
+        gives way to them.
+        """
         matrix = [[False] * self.letters for _ in range(self.letters)]
-        streams = []
-        for connection, index in self.connections:
-            node = connection.getFrom().getToNode()
-            merging = connection.getFrom().getID(), connection.getToLane().getID()
-            streams.append((node, node.getLinkIndex(connection), index, merging))
-        for crossing in self._walked:
-            node = self._net.getNode(crossing.node)
-            streams += [(node, crossing.request, index, (crossing.lane, "")) for index in crossing.letters]
-        for node_a, request_a, a, merging_a in streams:
-            for node_b, request_b, b, merging_b in streams:
-                if node_a is node_b and a != b and merging_a != merging_b and node_a.areFoes(request_a, request_b):
+        streams = [
+            (node := connection.getFrom().getToNode(), node.getLinkIndex(connection), letter, connection)
+            for connection, letter in self.connections
+        ]
+        for node, request, a, connection in streams:
+            foes = [
+                (b, other.getFrom() is connection.getFrom() and other.getToLane() is connection.getToLane())
+                for node_b, request_b, b, other in streams
+                if node_b is node and node.areFoes(request, request_b)
+            ]
+            turns, leaves = connection.getDirection() != STRAIGHT, connection.getFrom().getID()
+            foes += [
+                (b, turns and leaves not in crossing.edges)
+                for crossing in self._walked
+                for b in crossing.letters
+                if crossing.node == node.getID() and node.areFoes(request, crossing.request)
+            ]
+            for b, at_peace in foes:
+                if a != b and not at_peace:
                     matrix[a][b] = matrix[b][a] = True
         return tuple(tuple(row) for row in matrix)
 
@@ -57,10 +69,11 @@ class Crossing:
     """A pedestrian crossing with a signal."""
 
     node: str
-    lane: str
     request: int
     """Its number in the node's right-of-way matrix."""
     letters: tuple[int, ...]
+    edges: frozenset[str]
+    """Roads that it crosses."""
 
 
 def crossings(path: Path) -> dict[str, list[Crossing]]:
@@ -72,11 +85,14 @@ def crossings(path: Path) -> dict[str, list[Crossing]]:
             return {}
     inside: dict[str, tuple[str, int]] = {}
     letters: dict[tuple[str, str], tuple[int, ...]] = {}
+    edges: dict[str, frozenset[str]] = {}
     with opened(path) as file:
         for _, element in ElementTree.iterparse(file, forbid_dtd=True):
-            if element.tag == "junction":
+            if element.tag == "junction" and element.get("type") != "internal":
                 lanes = (element.get("intLanes") or "").split()
                 inside.update({lane: (element.get("id"), number) for number, lane in enumerate(lanes)})
+            elif element.tag == "edge" and element.get("function") == "crossing":
+                edges[f"{element.get('id')}_0"] = frozenset((element.get("crossingEdges") or "").split())
             elif element.tag == "connection" and element.get("tl") and (element.get("to") or "").startswith(":"):
                 names = [element.get(name) for name in ("linkIndex", "linkIndex2")]
                 used = tuple(int(name) for name in names if name and int(name) >= 0)
@@ -87,5 +103,5 @@ def crossings(path: Path) -> dict[str, list[Crossing]]:
     for (signal, lane), used in letters.items():
         if lane in inside:
             node, request = inside[lane]
-            found.setdefault(signal, []).append(Crossing(node, lane, request, used))
+            found.setdefault(signal, []).append(Crossing(node, request, used, edges.get(lane, frozenset())))
     return found

@@ -32,7 +32,7 @@ class Traffic:
     turned_veh: Mapping[tuple[str, str], float]
     """Vehicles that go on from one edge to the next, by (edge, next edge), as their routes have it."""
     space_m: float
-    """Mean length and gap of a vehicle; a passenger car's where nobody drives."""
+    """Mean length and gap of a motor vehicle; a passenger car's where nobody drives."""
     by_class_veh: Mapping[str, float]
     """Vehicles by vClass."""
     trips_veh: Mapping[tuple[str, ...], float]
@@ -40,6 +40,11 @@ class Traffic:
     `turned_veh`. What begins or ends elsewhere than on an edge has fewer than two."""
     named_by: Mapping[str, str]
     """Edges on their ways, as far as these are known, and who names each of them first."""
+
+    @property
+    def without_route_veh(self) -> float:
+        """Vehicles whose way SUMO finds itself."""
+        return sum(self.trips_veh.values())
 
 
 def turned_veh(net: Any, trips_veh: Mapping[tuple[str, ...], float]) -> dict[tuple[str, str], float]:

@@ -72,6 +72,8 @@ class SumoPlant:
         """(time, what the entry loops have counted since the control step began) at each reading."""
         self._boundary_s = [(junction.offset_s - self.begin_s) % junction.cycle_s for junction in network.junctions]
         self._sumo: Any = None
+        self._places: dict[str, list[tuple[Any, str]]] = {}
+        """Of each edge what SUMO counts its motor vehicles by: the edge as a whole, or some of its lanes."""
 
     def __enter__(self) -> Self:
         if SumoPlant._owner is not None:
@@ -91,6 +93,10 @@ class SumoPlant:
         self.sumo_time_s = time.perf_counter() - started
         SumoPlant._owner = self
         self._sumo = libsumo
+        for edge, lanes in self.network.edge_lanes.items():
+            whole = libsumo.edge.getLaneNumber(edge) == len(lanes)
+            places = [(libsumo.edge, edge)] if whole else [(libsumo.lane, f"{edge}_{lane}") for lane in lanes]
+            self._places[edge] = places
         return self
 
     def _arguments(self, additional: list[Path]) -> list[str]:
@@ -147,13 +153,14 @@ class SumoPlant:
                 self.time_s = min([sample_s, end_s, *self._boundary_s])
                 self._step()
                 self._entered.append((self.time_s, self._entered_so_far()))
-                x_veh = self._by_edge(self._sumo.edge.getLastStepVehicleNumber)
+                x_veh = self._by_link("getLastStepVehicleNumber")
                 np.maximum(peak_x, x_veh, out=peak_x)
                 present = self._sumo.vehicle.getIDCount() + len(self._sumo.simulation.getPendingVehicles())
                 spent_veh_s += present * (self.time_s - before_s)
-                queue_veh = self._by_edge(self._sumo.edge.getLastStepHaltingNumber)
+                queue_veh = self._by_link("getLastStepHaltingNumber")
                 np.maximum(peak_queue, queue_veh, out=peak_queue)
-            waiting = self._by_edge(lambda edge: len(self._sumo.edge.getPendingVehicles(edge)))
+            pending = self._sumo.edge.getPendingVehicles
+            waiting = np.array([float(sum(len(pending(edge)) for edge in link.edges)) for link in self.network.links])
             self.truth = Truth(
                 x_veh, waiting, queue_veh, peak_x, peak_queue, self._sumo.vehicle.getIDCount(), spent_veh_s / 3600
             )
@@ -202,8 +209,14 @@ class SumoPlant:
         lights.setProgramLogic(junction.id, lights.Logic(PROGRAM, 0, 0, phases))
         lights.setPhase(junction.id, 0)
 
-    def _by_edge(self, getter: Any) -> Floats:
-        return np.array([float(sum(map(getter, link.edges))) for link in self.network.links])
+    def _by_link(self, getter: str) -> Floats:
+        """The sum of a getter over each link's lanes for motor vehicles."""
+        return np.array(
+            [
+                float(sum(getattr(kind, getter)(name) for edge in link.edges for kind, name in self._places[edge]))
+                for link in self.network.links
+            ]
+        )
 
     def _interval(self) -> tuple[Any, Any]:
         """Getters of a loop's count and occupancy [%] over the present control step, until now.
