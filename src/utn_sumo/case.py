@@ -24,8 +24,9 @@ ABOUT_OUTPUT = frozenset({"output", "report", "gui_only"})
 """Sections of a configuration that say what SUMO writes and shows."""
 SHOWN = frozenset({"log", "error-log", "message-log", "no-step-log", "no-warnings", "verbose", "gui-settings-file"})
 """Options that say so wherever they stand, as all with `output` in their names do: SUMO does not look at sections."""
-OURS = frozenset({"net-file", "route-files", "additional-files", "begin", "end", "seed", "random"})
-"""Options that the fields of a `Case` stand for, and the seed."""
+SEEDS = frozenset({"seed", "random"})
+OURS = frozenset({"net-file", "route-files", "additional-files", "begin", "end", *SEEDS})
+"""Options that other fields of a `Case` stand for."""
 FILES = ("weight-files", "load-state")
 """Further options that name files to read."""
 LONG = {"n": "net-file", "r": "route-files", "a": "additional-files", "b": "begin", "e": "end", "w": "weight-files"}
@@ -49,6 +50,8 @@ class Case:
     """Time that a vehicle stands before SUMO takes it out of the way; none is ever where it is not positive."""
     options: tuple[tuple[str, str], ...]
     """Whatever else it says of SUMO's options, as (name, value); files among them as paths that hold from here."""
+    seeds: tuple[tuple[str, str], ...] = ()
+    """What it says of chance, likewise: a run of ours has a seed of its own."""
 
     @property
     def step_s(self) -> float:
@@ -147,6 +150,7 @@ def read(path: Path) -> Case:
         end_s=end_s if end_s >= 0 else None,
         teleport_s=_seconds(path, "time-to-teleport", said.get("time-to-teleport", str(DEFAULT_TELEPORT_S))),
         options=tuple((name, value) for name, value in said.items() if name not in OURS),
+        seeds=tuple((name, value) for name, value in said.items() if name in SEEDS),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -245,7 +246,7 @@ def replay(folder: Path) -> None:
     from utn_sumo import replay as writer  # noqa: PLC0415 - heavy
 
     configuration = writer.write(folder)
-    click.echo(f"wrote {configuration}: run it with  sumo -c {configuration}")
+    click.echo(f"wrote {configuration}: run it with  sumo -c {shlex.quote(str(configuration))}")
 
 
 @cli.command()

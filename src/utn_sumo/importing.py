@@ -181,6 +181,7 @@ def _write_scenario(path: Path, chosen: Case, copies: _Copies) -> None:
         "input": read,
         "time": {"begin": case.in_digits(chosen.begin_s), **ends},
         "processing": {name: value for name, value in chosen.options if name not in read},
+        "random_number": dict(chosen.seeds),
     }
     root = ET.Element("configuration")
     for name, options in sections.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -132,7 +133,9 @@ def import_table(result: dict[str, Any]) -> None:
     for label, value in rows.items():
         view.add_row(escape(label), escape(value))
     console.print(view)
-    console.print(f"run it with  utn run {result['scenario']}", markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"run it with  utn run {shlex.quote(result['scenario'])}", markup=False, highlight=False, soft_wrap=True
+    )
 
 
 @contextmanager

@@ -95,11 +95,15 @@ def test_it_needs_nothing_that_lies_outside_of_it(scattered: Path, tmp_path: Pat
 
 
 def test_window_step_teleport_and_options_are_kept_and_outputs_left_out(scattered: Path, tmp_path: Path) -> None:
+    text = scattered.read_text(encoding="utf-8")
+    scattered.write_text(text.replace("</configuration>", '<seed value="42"/></configuration>'), encoding="utf-8")
     imported(scattered, tmp_path / "own")
     kept, original = case.read(tmp_path / "own" / "scenario.sumocfg"), case.read(scattered)
     for name in ("begin_s", "end_s", "step_s", "teleport_s"):
         assert getattr(kept, name) == getattr(original, name)
     assert sorted(kept.options) == sorted(original.options)
+    # The seed is for the bare SUMO: a run of ours has its own.
+    assert kept.seeds == original.seeds == (("seed", "42"),)
     assert "theirs.xml" not in (tmp_path / "own" / "scenario.sumocfg").read_text(encoding="utf-8")
 
 
