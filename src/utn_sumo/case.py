@@ -23,6 +23,7 @@ DEFAULT_TELEPORT_S = 300.0
 ABOUT_OUTPUT = frozenset({"output", "report", "gui_only"})
 """Sections of a configuration that say what SUMO writes and shows."""
 SHOWN = frozenset({"log", "error-log", "message-log", "no-step-log", "no-warnings", "verbose", "gui-settings-file"})
+SHOWN |= {"duration-log.disable", "duration-log.statistics", "print-options", "aggregate-warnings"}
 """Options that say so wherever they stand, as all with `output` in their names do: SUMO does not look at sections."""
 SEEDS = frozenset({"seed", "random"})
 OURS = frozenset({"net-file", "route-files", "additional-files", "begin", "end", *SEEDS})
@@ -31,6 +32,7 @@ FILES = ("weight-files", "load-state")
 """Further options that name files to read."""
 LONG = {"n": "net-file", "r": "route-files", "a": "additional-files", "b": "begin", "e": "end", "w": "weight-files"}
 LONG |= {"net": "net-file", "routes": "route-files", "additional": "additional-files", "weights": "weight-files"}
+LONG |= {"W": "no-warnings", "v": "verbose", "l": "log", "p": "print-options"}
 """SUMO's short and older names of options."""
 UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 

@@ -74,10 +74,11 @@ def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bo
 def _study(command: Callable[..., None]) -> Callable[..., None]:
     """The options that studies over recorded runs have in common."""
     for option in (
-        click.option("--step", default="10", show_default=True, help="Model step in seconds; 120 is the whole cycle."),
-        click.option("--hours", default="2", show_default=True, help="Simulated hours of each run."),
+        click.argument("case", required=False),
+        click.option("--step", help="Model step in seconds, up to the whole cycle.  [10, or a little less]"),
+        click.option("--hours", help="Simulated hours of each run.  [2; of CASE its window]"),
         click.option("--controller", default="dmpc", show_default=True, help="Controller of the recorded runs."),
-        click.option("--net", default="utn17", show_default=True, help="Shipped network, or a .net.xml file."),
+        click.option("--net", help="Shipped network, or a .net.xml file.  [utn17]"),
     ):
         command = option(command)
     return command
@@ -85,23 +86,31 @@ def _study(command: Callable[..., None]) -> Callable[..., None]:
 
 @cli.command()
 @_study
-@click.option("--demand", default="0.6,1.0,1.3", show_default=True, help="Demands, separated by commas.")
+@click.option("--demand", help="Demands, separated by commas.  [0.6,1.0,1.3; of CASE 1.0]")
 @click.option("--seeds", default="5", show_default=True, help="How many seeds, from 1 on.")
 @click.option("--horizon", default="7", show_default=True, help="Control steps ahead.")
 @click.option("--inputs", default="known", show_default=True, help="Demand of the predictions: known or forecast.")
 @click.option("--turning", default="forecast", show_default=True, help="Turning fractions: known or forecast.")
 @click.option("--calibration", help="Calibration file, or none.  [the one beside the net]")
-@click.option("--floor/--no-floor", "with_floor", default=True, help="Measure the spread of SUMO itself too.")
+@click.option("--floor/--no-floor", "with_floor", default=None, help="Measure SUMO's own spread too.  [not of CASE]")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON list, an object a demand, and nothing else.")
-def mismatch(out: Path | None, with_floor: bool, as_json: bool, demand: str, **flags: Any) -> None:
-    """Measure how far the model is from the plant, in open loop, by horizon and link."""
+def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: str | None, **flags: Any) -> None:
+    """Measure how far the model is from the plant, in open loop, by horizon and link.
+
+    CASE is a .sumocfg of your own; the seeds then are SUMO's alone.
+    """
     from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
 
-    base = {name: flags[name] for name in ("net", "controller", "hours", "calibration") if flags[name] is not None}
-    demands, seeds = _numbers("demand", demand), range(1, 1 + _whole("seeds", flags["seeds"]))
-    horizon, step_s = _whole("horizon", flags["horizon"]), _numbers("step", flags["step"])[0]
-    folder = recording.new_folder(out, f"mismatch-{Path(flags['net']).name.partition('.')[0]}-{flags['controller']}")
+    own = flags["case"] is not None
+    if own and with_floor:
+        raise SettingError(f"the floor draws the future of a demand of ours: leave --floor out for {flags['case']!r}")
+    with_floor = not own if with_floor is None else with_floor
+    base = _base(flags) | ({} if flags["calibration"] is None else {"calibration": flags["calibration"]})
+    demands = _numbers("demand", demand or ("1.0" if own else "0.6,1.0,1.3"))
+    seeds = range(1, 1 + _whole("seeds", flags["seeds"]))
+    horizon, step_s = _whole("horizon", flags["horizon"]), _step_s(flags)
+    folder = recording.new_folder(out, f"mismatch-{Path(base['net']).name.partition('.')[0]}-{flags['controller']}")
     total = len(demands) * (len(seeds) + with_floor)
     with report.counter("runs and replays", total) as tick:
         results = study.study_mismatch(
@@ -154,20 +163,24 @@ def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, 
 
 @cli.command()
 @_study
-@click.option("--demand", default="0.7,0.9,1.1,1.25", show_default=True, help="Demands, separated by commas.")
+@click.option("--demand", help="Demands, separated by commas.  [0.7,0.9,1.1,1.25; of CASE 1.0]")
 @click.option("--seeds", default="201,202", show_default=True, help="Seeds, separated by commas.")
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder for the runs; must be new or empty."
 )
-def calibrate(out: Path, demand: str, seeds: str, step: str, **flags: Any) -> None:
-    """Fit the model to recorded runs and write its parameters with their standard errors."""
+def calibrate(out: Path, demand: str | None, seeds: str, **flags: Any) -> None:
+    """Fit the model to recorded runs and write its parameters with their standard errors.
+
+    CASE is a .sumocfg of your own; the seeds then are SUMO's alone.
+    """
     from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
 
-    demands, seed_list = _numbers("demand", demand), [int(seed) for seed in _numbers("seeds", seeds)]
-    base = {**flags, "calibration": "none"}
+    demands = _numbers("demand", demand or ("0.7,0.9,1.1,1.25" if flags["case"] is None else "1.0"))
+    seed_list = [int(seed) for seed in _numbers("seeds", seeds)]
+    base = _base(flags) | {"calibration": "none"}
     folder = recording.new_folder(out, "calibration")
     with report.counter("runs", len(demands) * len(seed_list)) as tick:
-        content = study.study_calibration(base, demands, seed_list, folder, step_s=_numbers("step", step)[0], tick=tick)
+        content = study.study_calibration(base, demands, seed_list, folder, step_s=_step_s(flags), tick=tick)
     path = folder / "calibration.json"
     recording.write_json(path, content)
     report.calibration_table(content)
@@ -296,6 +309,21 @@ def _builder() -> Any:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def _base(flags: dict[str, Any]) -> dict[str, Any]:
+    """What the runs of a study have in common: net or case, controller, hours."""
+    own, net, hours = flags["case"], flags["net"], flags["hours"]
+    if own is not None and net is not None:
+        raise SettingError(f"setting 'net' is {net!r}, beside {own!r}: give one of them")
+    if own is None and hours is None:
+        hours = "2"
+    return {"net": own or net or "utn17", "controller": flags["controller"], **({"hours": hours} if hours else {})}
+
+
+def _step_s(flags: dict[str, Any]) -> float | None:
+    """The model step that is asked for, if any is."""
+    return None if flags["step"] is None else _numbers("step", flags["step"])[0]
 
 
 def _numbers(name: str, text: str) -> list[float]:

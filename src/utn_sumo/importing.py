@@ -103,7 +103,7 @@ def calibrate(folder: Path, seeds: Sequence[int], tick: Callable[[], None]) -> P
     """Fit the model to runs of the scenario in a folder, `tick` after each, and put its parameters beside the net."""
     base = {"net": str(folder / SCENARIO), "calibration": "none"}
     with tempfile.TemporaryDirectory() as runs:
-        content = study.study_calibration(base, CALIBRATED_AT, seeds, Path(runs), step_s=calibration.STEP_S, tick=tick)
+        content = study.study_calibration(base, CALIBRATED_AT, seeds, Path(runs), step_s=None, tick=tick)
     path = calibration.beside_net(_network(folder))
     recording.write_json(path, content)
     return path

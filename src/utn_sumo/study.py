@@ -43,19 +43,24 @@ def study_mismatch(
     seeds: Sequence[int],
     folder: Path,
     *,
-    step_s: float,
+    step_s: float | None,
     horizon: int,
     inputs: str,
     turning: str,
     with_floor: bool,
     tick: Callable[[], None],
 ) -> list[dict[str, Any]]:
-    """The mismatch by demand: one object each, under the names of `mismatch.summary`."""
+    """The mismatch by demand: one object each, under the names of `mismatch.summary`.
+
+    The net of `base` may be a .sumocfg, whose traffic `demands` scale. Without a `step_s` the model steps as the loops
+    are read, every 10 s or as near under it as divides the control step.
+    """
     for name, value in (("inputs", inputs), ("turning", turning)):
         if value not in INPUTS:
             raise SettingError(f"setting {name!r} is {value!r}: it must be 'known' or 'forecast'")
-    whole = network.load(base["net"])
+    whole = _plant_network(base["net"])
     model = calibration.for_model(whole, base.get("calibration"))
+    step_s = step_s or whole.sample_s
     check_step(whole, step_s)
     results = []
     for demand in demands:
@@ -63,7 +68,9 @@ def study_mismatch(
         folders = record(items, folder, tick)
         log = Log.stack([recording.read_log(path) for path in folders])
         if len(log.green_s) <= horizon + 1:
-            raise SettingError(f"setting 'hours' is {items[0].hours:g}: make it more than {horizon + 1} control steps")
+            raise SettingError(
+                f"setting 'hours' gives runs of {len(log.green_s)} control steps: make them more than {horizon + 1}"
+            )
         floor_veh = None
         if with_floor:
             cuts = np.linspace(1, len(log.green_s) - horizon, FLOOR_CUTS + 2)[1:-1].astype(int)
@@ -78,7 +85,7 @@ def study_mismatch(
                 "controller": items[0].controller,
                 "demand": demand,
                 "seeds": list(seeds),
-                "hours": items[0].hours,
+                "hours": len(log.x_veh) * whole.control_step_s / 3600,
                 "step_s": step_s,
                 "inputs": inputs,
                 "turning": turning,
@@ -122,14 +129,15 @@ def study_calibration(
     seeds: Sequence[int],
     folder: Path,
     *,
-    step_s: float,
+    step_s: float | None,
     tick: Callable[[], None],
 ) -> dict[str, Any]:
     """Record runs and fit the model with a step of `step_s` to them: the content of a calibration file.
 
-    The net of `base` may be a .sumocfg, whose traffic `demands` scale.
+    Net, demands and step are as in `study_mismatch`.
     """
     whole = _plant_network(base["net"])
+    step_s = step_s or whole.sample_s
     check_step(whole, step_s)
     items = [scenario(**base, demand=demand, seed=seed) for demand in demands for seed in seeds]
     log = Log.stack([recording.read_log(path) for path in record(items, folder, tick)])

@@ -66,7 +66,7 @@ def same_trips(original: Path, copy: Path, tmp_path: Path, controller: str, **se
     assert trips(tmp_path / "copy" / "trips.xml") == trips(tmp_path / "original" / "trips.xml")
 
 
-@pytest.mark.parametrize("controller", ["native", "fixed"])
+@pytest.mark.parametrize("controller", ["native", "fixed", "dmpc"])
 def test_the_import_gives_the_trips_of_the_original_vehicle_for_vehicle(
     scattered: Path, tmp_path: Path, controller: str
 ) -> None:
@@ -160,7 +160,7 @@ def test_the_table_says_what_was_found_and_how_to_run_it(town: Path, tmp_path: P
         "conflict",
         "passenger",
         "without a route",
-        "1: SUMO finds their ways",
+        "1: taken to go the fastest way",
         f"utn run {tmp_path / 'own' / 'scenario.sumocfg'}",
     ):
         assert words in answer.stdout, words

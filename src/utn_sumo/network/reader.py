@@ -140,7 +140,7 @@ class _Reader:
         self.net = net
         self.signals = signals
         self.fractions = fractions
-        self.coming_veh = {} if traffic is None else _coming_veh(net, traffic)
+        self.coming_veh = None if traffic is None else _coming_veh(net, traffic)
         self.space_m = SPACE_PER_VEHICLE_M if traffic is None else traffic.space_m
         # Approach edge -> position of the junction that it enters.
         self.junction_of = {edge: position for position, signal in enumerate(signals) for edge in signal.approaches}
@@ -242,7 +242,7 @@ class _Reader:
         """
         given = [self.fractions.get((edge_id, to_edge)) for to_edge in connections]
         usual = [usual_weight(each) for each in connections.values()]
-        coming = [self.coming_veh.get((edge_id, to_edge), 0.0) for to_edge in connections]
+        coming = [(self.coming_veh or {}).get((edge_id, to_edge), 0.0) for to_edge in connections]
         weights = [veh + weight / sum(usual) for veh, weight in zip(coming, usual, strict=True)]
         if any(value is not None for value in given):
             weights = [value or 0.0 for value in given]
@@ -254,8 +254,9 @@ class _Reader:
     def _worth_veh(self, edge_id: str) -> float:
         """How much the turning fractions of an approach edge are worth."""
         targets = [edge.getID() for edge in self.net.getEdge(edge_id).getOutgoing()]
-        if any((edge_id, to_edge) in self.fractions for to_edge in targets):
-            return GIVEN_TURNING_VEH
+        if self.coming_veh is None:
+            given = any((edge_id, to_edge) in self.fractions for to_edge in targets)
+            return GIVEN_TURNING_VEH if given else USUAL_TURNING_VEH
         coming = sum(self.coming_veh.get((edge_id, to_edge), 0.0) for to_edge in targets)
         return min(GIVEN_TURNING_VEH, USUAL_TURNING_VEH + coming)
 
