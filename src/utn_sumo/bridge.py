@@ -24,14 +24,12 @@ from utn_sumo import (
     native,
     network,
     recording,
-    routes,
-    signals,
+    streets,
     traffic,
 )
 from utn_sumo.case import SUFFIX, Case
 from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
-from utn_sumo.errors import SettingError
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.sumo import SumoPlant
 from utn_sumo.plant.untouched import Look
@@ -63,7 +61,7 @@ def run(
     if scenario.controller == native.NAME:
         return native.run(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
     chosen = traffic.given(scenario) if scenario.net.endswith(SUFFIX) else None
-    net = network.load(scenario.net) if chosen is None else controllable(chosen)
+    net = network.load(scenario.net) if chosen is None else streets.controllable(chosen)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.settings)
@@ -155,21 +153,6 @@ def run(
 
 def _progress(time_s: float, duration_s: float, seen: Look) -> Progress:
     return Progress(time_s, duration_s, seen.time_spent_veh_h, float(seen.halting_veh))
-
-
-def controllable(chosen: Case) -> Network:
-    """A net as other people have it, with the signals left alone whose own stages can't be shown safely.
-
-    Raises SettingError for a mesoscopic case, where there are no lanes to watch.
-    """
-    if dict(chosen.options).get("mesosim", "false") == "true":
-        raise SettingError(
-            f"scenario {str(chosen.file)!r} has mesosim, which knows no lanes: leave it out, or use --controller native"
-        )
-    name, additional, coming = str(chosen.net_file), chosen.additional_files, routes.read(chosen)
-    net = network.load(name, None, additional, coming)
-    refused = signals.refused(net)
-    return network.load(name, refused, additional, coming) if refused else net
 
 
 def _predictor(net: Network, scenario: Scenario, driving: Path | Case, steps: int) -> Predictor:

@@ -215,13 +215,9 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
 def inspect(net: str, out: Path | None, as_json: bool) -> None:
     """Show what the bench makes of NET: links, stages, storage, what is controlled and what is left alone."""
-    from utn_sumo import case, inspection, network, plots, recording, report  # noqa: PLC0415 - heavy
+    from utn_sumo import inspection, network, plots, recording, report, streets  # noqa: PLC0415 - heavy
 
-    if net.endswith(case.SUFFIX):
-        chosen = case.read(Path(net))
-        found = network.load(str(chosen.net_file), additional=chosen.additional_files)
-    else:
-        found = network.load(net)
+    found = streets.named(net)
     result = inspection.inspect(found)
     folder = recording.new_folder(out, f"inspect-{found.name}")
     recording.write_json(folder / "inspection.json", result)

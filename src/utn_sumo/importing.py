@@ -22,7 +22,7 @@ from xml.etree import ElementTree as ET
 
 from defusedxml import ElementTree
 
-from utn_sumo import bridge, calibration, case, detectors, inspection, network, plots, recording, routes, study
+from utn_sumo import calibration, case, detectors, inspection, network, plots, recording, routes, streets, study
 from utn_sumo.case import Case
 from utn_sumo.contract import Network
 from utn_sumo.network import Traffic
@@ -58,7 +58,7 @@ def read(path: Path) -> Import:
     chosen = case.read(path)
     traffic = routes.read(chosen)
     routes.check(chosen, traffic)
-    bridge.controllable(chosen)
+    streets.controllable(chosen)
     return Import(chosen, traffic)
 
 
@@ -110,7 +110,7 @@ def calibrate(folder: Path, seeds: Sequence[int], tick: Callable[[], None]) -> P
 
 
 def _network(folder: Path) -> Network:
-    return bridge.controllable(case.read(folder / SCENARIO))
+    return streets.controllable(case.read(folder / SCENARIO))
 
 
 def _beside(net_file: Path, ending: str) -> Path:

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 import scipy.sparse as sp
 
-from utn_sumo.contract import EXIT, SAMPLE_S, Floats, Network
+from utn_sumo.contract import EXIT, SAMPLE_S, Floats, Ints, Network
 from utn_sumo.errors import SettingError
 
 Sparse = Any
@@ -28,6 +28,9 @@ class Operations(Protocol):
     """The few operations that the model needs besides + - * /."""
 
     def matmul(self, matrix: Sparse, vector: Any) -> Any: ...
+    def take(self, vector: Any, places: Ints) -> Any:
+        """The vector's numbers at these places, one of them as often as it is named."""
+
     def minimum(self, a: Any, b: Any) -> Any: ...
     def maximum(self, a: Any, b: Any) -> Any: ...
     def share(self, a: Any) -> Any:
@@ -47,6 +50,9 @@ class NumpyOperations:
     def matmul(self, matrix: Sparse, vector: Any) -> Any:
         batch = np.shape(vector)[:-1]
         return (matrix @ vector.reshape(-1, matrix.shape[1]).T).T.reshape(*batch, -1) if batch else matrix @ vector
+
+    def take(self, vector: Any, places: Ints) -> Any:
+        return np.take(vector, places, axis=-1)
 
     def minimum(self, a: Any, b: Any) -> Any:
         return np.minimum(a, b)
@@ -71,6 +77,9 @@ class CasadiOperations:
 
     def matmul(self, matrix: Sparse, vector: Any) -> Any:
         return self._casadi.mtimes(self._casadi.DM(matrix.tocsc()), vector)
+
+    def take(self, vector: Any, places: Ints) -> Any:
+        return vector[places.tolist()]
 
     def minimum(self, a: Any, b: Any) -> Any:
         return self._casadi.fmin(a, b)
@@ -125,8 +134,22 @@ class ModelState:
 
 
 @dataclass(frozen=True)
+class Arrivals:
+    """Who has reached the tail of the queue by some moment of a step."""
+
+    before_veh: Any
+    """Of those who were on the link when the step began."""
+    own_share: Any
+    """Of who comes in within the step."""
+
+    def veh(self, inflow_veh: Any) -> Any:
+        """All of them. It may be negative only where the delay has just grown."""
+        return self.before_veh + self.own_share * inflow_veh
+
+
+@dataclass(frozen=True)
 class StepTerms:
-    """What decides a step's flows beside the flows themselves; some of it is a list over past samples."""
+    """What decides a step's flows beside the flows themselves."""
 
     q_veh: Any
     """(M,) queued at the start."""
@@ -134,14 +157,10 @@ class StepTerms:
     """(M,)"""
     wanting_veh: Any
     """(Z,) that want to enter from outside."""
-    moving_veh: Any
-    """(Z,) on the link at the start and not queued."""
-    past_veh: Sequence[Any]
-    """(Z,) inflow of each past sample."""
-    on_the_way: Sequence[Any]
-    """(Z,) of the step's own and of each past inflow the share that has not arrived at the end."""
-    in_green: tuple[Any, Sequence[Any], Sequence[Any]] | None
-    """The last three by turn, and counted at the end of each turn's green; None if that is the step's end."""
+    arrivals: Arrivals
+    """By link, at the step's end."""
+    in_green: Arrivals | None
+    """By turn, at the end of each turn's green; None if that is the step's end."""
     saturated_veh: Any
     """(M,) the second term of SPEC 2.3."""
     room_veh: Any
@@ -216,6 +235,7 @@ class LinkModel:
         """(Z, M) 1 where a turn leaves a link: sums by link."""
         self.feeds = _incidence(network.turn_next[fed], np.flatnonzero(fed), (links, turns))
         """(Z, M) 1 where a turn feeds a link."""
+        self._next_link = np.maximum(network.turn_next, 0)
         stages = np.repeat(np.arange(len(network.stages)), [len(stage.turns) for stage in network.stages])
         served = np.concatenate([stage.turns for stage in network.stages]).astype(np.int64)
         self.served = _incidence(served, stages, (turns, len(network.stages)))
@@ -260,7 +280,11 @@ class LinkModel:
 
     def at_turns(self, links: Any) -> Any:
         """(..., M) each turn's link's number of (..., Z)."""
-        return self.operations.matmul(self.leaves.T, links)
+        return self.operations.take(links, self.network.turn_link)
+
+    def _at_next(self, links: Any) -> Any:
+        """(..., M) the number of (..., Z) of the link that each turn feeds; 0 at exits."""
+        return self.operations.take(links, self._next_link) * (1.0 - self._is_exit)
 
     def delay_s(self, queue_veh: Any) -> Any:
         """(Z,) time from entry to the tail of the queue (SPEC 2.6), never negative."""
@@ -290,19 +314,19 @@ class LinkModel:
         curve = summed[..., low, :] * (1 - part) + summed[..., low + 1, :] * part
         return tuple(np.moveaxis(np.diff(curve, axis=-2), -2, 0))
 
-    def arriving_veh(self, moving_veh: Any, inflow_veh: Any, past: Sequence[Any], share: Sequence[Any]) -> Any:
+    def _arrivals(self, moving_veh: Any, past: Sequence[Any], share: Sequence[Any]) -> Arrivals:
         """Vehicles that reach the tail of the queue by the time of `share` (SPEC 2.5 as cumulative curves).
 
         All by link, or all by turn with each link's numbers at its turns.
 
         Who is on the link and not queued, or comes in now, arrives unless it entered less than the delay
         ago. For a constant delay this is SPEC 2.5 exactly; for a varying one it conserves vehicles,
-        and nobody arrives twice or never. It may be negative only where the delay has just grown.
+        and nobody arrives twice or never.
         """
-        still = share[0] * inflow_veh
+        before = moving_veh
         for inflow_then, share_then in zip(past, share[1:], strict=False):
-            still = still + share_then * inflow_then
-        return moving_veh + inflow_veh - still
+            before = before - share_then * inflow_then
+        return Arrivals(before, 1.0 - share[0])
 
     def saturated_veh(self, green_s: Any, fraction: Any) -> Any:
         """(M,) what green lets through: the second term of SPEC 2.3. `green_s` is by turn.
@@ -383,7 +407,7 @@ class LinkModel:
         # exits have all the room in the world.
         open_fraction = fraction * ops.share(turn_green_s)
         feeding = ops.matmul(self.feeds, open_fraction)
-        claim = open_fraction / ops.maximum(ops.matmul(self.feeds.T, feeding) + self._is_exit, 1e-9)
+        claim = open_fraction / ops.maximum(self._at_next(feeding) + self._is_exit, 1e-9)
 
         queue = self.by_link(state.q_veh)
         moving = state.x_veh - queue
@@ -391,15 +415,14 @@ class LinkModel:
         in_green, opening = None, None
         if green_end_s is not None:
             past_by_turn = [self.at_turns(past) for past in state.past_inflow_veh]
-            in_green = self.at_turns(moving), past_by_turn, self.on_the_way(self.at_turns(delay), green_end_s)
+            share = self.on_the_way(self.at_turns(delay), green_end_s)
+            in_green = self._arrivals(self.at_turns(moving), past_by_turn, share)
             opening = self.opening(turn_green_s, green_end_s)
         return StepTerms(
             q_veh=state.q_veh,
             fraction=fraction,
             wanting_veh=(state.source_queue_veh + demand_veh) * self._is_source,
-            moving_veh=moving,
-            past_veh=state.past_inflow_veh,
-            on_the_way=self.on_the_way(delay),
+            arrivals=self._arrivals(moving, state.past_inflow_veh, self.on_the_way(delay)),
             in_green=in_green,
             saturated_veh=self.saturated_veh(turn_green_s, fraction),
             room_veh=ops.maximum(self.room_veh(state.x_veh), 0.0),
@@ -413,15 +436,14 @@ class LinkModel:
         The guess is right where the flows have the same inflow and room: that is the exact model.
         """
         ops = self.operations
-        arriving = ops.maximum(self.arriving_veh(terms.moving_veh, inflow_veh, terms.past_veh, terms.on_the_way), 0.0)
+        arriving = ops.maximum(terms.arrivals.veh(inflow_veh), 0.0)
         queued = terms.q_veh + terms.fraction * self.at_turns(arriving)
         unsaturated = queued
         if terms.in_green is not None:
-            moving, past, share = terms.in_green
-            in_time = self.arriving_veh(moving, self.at_turns(inflow_veh), past, share)
+            in_time = terms.in_green.veh(self.at_turns(inflow_veh))
             unsaturated = terms.q_veh + terms.fraction * ops.maximum(in_time, 0.0)
         # SPEC 2.3, the three terms.
-        oversaturated = terms.claim * ops.matmul(self.feeds.T, open_room_veh) + INFINITE_ROOM_VEH * self._is_exit
+        oversaturated = terms.claim * self._at_next(open_room_veh) + INFINITE_ROOM_VEH * self._is_exit
         leaving = ops.minimum(unsaturated, ops.minimum(terms.saturated_veh, oversaturated))
         room = terms.room_veh
         if terms.opening is not None:

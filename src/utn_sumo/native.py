@@ -10,8 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from utn_sumo import metrics, network, recording, traffic
+from utn_sumo import metrics, monitor, network, recording, streets, traffic
 from utn_sumo.case import SUFFIX, Case
+from utn_sumo.errors import UtnError
 from utn_sumo.plant import untouched
 from utn_sumo.plant.sumo import records, write_outputs
 from utn_sumo.plant.untouched import Look
@@ -25,7 +26,8 @@ def run(
 ) -> dict[str, Any]:
     """Run it and return its measures under the names of SPEC 7; everything else is in the folder.
 
-    Queues and vehicles are the most on one road. What only our own links and signals have is null. `on_look` gets
+    Queues and vehicles are the most on one road. What only our own links have is null; signals are judged as far as
+    we could control them, against the clearances that they show themselves. `on_look` gets
     the time into the run [s], how long it will be [s] (0 where that is unknown), and how full the roads are. Raises
     UtnError.
     """
@@ -58,7 +60,7 @@ def run(
         "over_storage_veh": None,
         "teleports": metrics.teleports(folder / "statistics.xml"),
         "gridlock": None,
-        "unsafe_signal_s": None,
+        "unsafe_signal_s": _unsafe_s(chosen, folder, outcome.end_s),
         "fallbacks": 0,
         "sumo_time_s": outcome.sumo_time_s,
         "control_time_s": 0.0,
@@ -68,6 +70,15 @@ def run(
     }
     recording.write_json(folder / recording.RESULT, result)
     return result
+
+
+def _unsafe_s(chosen: Case, folder: Path, end_s: float) -> int | None:
+    """Seconds in which the net's own signals were unsafe; None where there are none that can be judged."""
+    try:
+        net = streets.controllable(chosen)
+    except UtnError:
+        return None
+    return monitor.watch(net, folder / "signals.xml", end_s - chosen.begin_s, chosen.begin_s).unsafe_signal_s
 
 
 def of(scenario: Scenario) -> Case:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from utn_sumo import bridge, calibration, case, floor, forecast_report, mismatch, network, plots, recording
-from utn_sumo.contract import Network
+from utn_sumo import bridge, calibration, floor, forecast_report, mismatch, plots, recording, streets
 from utn_sumo.errors import SettingError
 from utn_sumo.model import check_step
 from utn_sumo.recording import Log
@@ -58,7 +57,7 @@ def study_mismatch(
     for name, value in (("inputs", inputs), ("turning", turning)):
         if value not in INPUTS:
             raise SettingError(f"setting {name!r} is {value!r}: it must be 'known' or 'forecast'")
-    whole = _plant_network(base["net"])
+    whole = streets.named(base["net"])
     model = calibration.for_model(whole, base.get("calibration"))
     step_s = step_s or whole.sample_s
     check_step(whole, step_s)
@@ -136,7 +135,7 @@ def study_calibration(
 
     Net, demands and step are as in `study_mismatch`.
     """
-    whole = _plant_network(base["net"])
+    whole = streets.named(base["net"])
     step_s = step_s or whole.sample_s
     check_step(whole, step_s)
     items = [scenario(**base, demand=demand, seed=seed) for demand in demands for seed in seeds]
@@ -151,8 +150,3 @@ def study_calibration(
     }
     hours = len(log.x_veh) * whole.control_step_s / 3600
     return {"made_from": {**made, "hours": hours}, **fitted}
-
-
-def _plant_network(name: str) -> Network:
-    """The network that runs on `name`, a net or a .sumocfg, are of."""
-    return bridge.controllable(case.read(Path(name))) if name.endswith(case.SUFFIX) else network.load(name)

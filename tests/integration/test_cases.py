@@ -11,7 +11,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from utn_sumo import bridge, case, forecast_report, replay, traffic
+from utn_sumo import bridge, case, forecast_report, replay, streets, traffic
 from utn_sumo.cli import cli
 from utn_sumo.contract import Network
 from utn_sumo.errors import ResultError, SettingError
@@ -172,7 +172,7 @@ def test_programmes_in_additional_files_stand_for_the_nets(town: Path, tmp_path:
     town.with_name("own.add.xml").write_text(added, encoding="utf-8")
     text = town.read_text(encoding="utf-8").replace("</input>", '<additional-files value="own.add.xml"/></input>')
     town.write_text(text, encoding="utf-8")
-    net = bridge.controllable(case.read(town))
+    net = streets.controllable(case.read(town))
     junction = net.junctions[1]
     assert (junction.cycle_s, junction.offset_s, len(junction.stages)) == (70, 4, 2)
     # 70 s and 120 s have no common multiple that is worth waiting for: the longest cycle is the step.

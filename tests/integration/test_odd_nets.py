@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from utn_sumo import bridge, case, inspection, monitor
+from utn_sumo import bridge, case, inspection, monitor, streets
 from utn_sumo.cli import cli
 from utn_sumo.errors import UtnError
 from utn_sumo.plant.sumo import PROGRAM
@@ -233,7 +233,7 @@ def test_controllers_run_it_safely(make: Make, controller: str, made: Callable[[
 
 @every_case
 def test_signals_are_left_alone_only_where_nobody_can_control_them(make: Make, made: Callable[[Make], Path]) -> None:
-    alone = bridge.controllable(case.read(made(make))).left_alone
+    alone = streets.controllable(case.read(made(make))).left_alone
     expected = LEFT_ALONE.get(make, set())
     assert set(alone) == expected or (make in EITHER and alone), alone
 
@@ -291,7 +291,7 @@ def test_the_monitor_has_nothing_to_say_against_a_nets_own_programme(
 ) -> None:
     chosen = case.read(made(make))
     result, folder = ran(make, "native")
-    net = bridge.controllable(chosen)
+    net = streets.controllable(chosen)
     verdict = monitor.watch(net, folder / "signals.xml", result["hours"] * 3600, chosen.begin_s)
     assert not verdict.reasons
 
@@ -386,7 +386,7 @@ def test_arrows_shorter_than_our_own_least_green_are_still_shown(controller: str
 
 
 def test_the_last_programme_that_is_read_is_the_one_to_start_from(made: Callable[[Make], Path], ran: Run) -> None:
-    (junction,) = bridge.controllable(case.read(made(odd_nets.several_programmes))).junctions
+    (junction,) = streets.controllable(case.read(made(odd_nets.several_programmes))).junctions
     assert (junction.cycle_s, junction.offset_s) == (80, 7)
     _, native = ran(odd_nets.several_programmes, "native")
     assert {program for *_, program in switches(native, "C")} == {"evening"}
@@ -463,7 +463,7 @@ def test_zipped_files_give_the_same_trips(controller: str, ran: Run) -> None:
 @pytest.mark.parametrize("make", [odd_nets.pedestrians, odd_nets.bicycle_lanes], ids=lambda make: make.__name__)
 def test_sidewalks_and_bicycle_lanes_hold_no_cars(make: Make, made: Callable[[Make], Path]) -> None:
     links, usual = (
-        {link["id"]: link for link in inspection.inspect(bridge.controllable(case.read(made(each))))["links"]}
+        {link["id"]: link for link in inspection.inspect(streets.controllable(case.read(made(each))))["links"]}
         for each in (make, odd_nets.plain)
     )
     assert links["W-C"]["storage_veh"] == pytest.approx(usual["W-C"]["storage_veh"], rel=0.1)
@@ -471,12 +471,12 @@ def test_sidewalks_and_bicycle_lanes_hold_no_cars(make: Make, made: Callable[[Ma
 
 
 def test_every_stream_that_shares_a_letter_is_served(made: Callable[[Make], Path]) -> None:
-    net = bridge.controllable(case.read(made(odd_nets.shared_letters)))
+    net = streets.controllable(case.read(made(odd_nets.shared_letters)))
     assert net.serves.any(axis=0).all()
 
 
 def test_a_turn_that_passes_the_signals_by_waits_for_no_stage(made: Callable[[Make], Path]) -> None:
-    net = bridge.controllable(case.read(made(odd_nets.slip_lanes)))
+    net = streets.controllable(case.read(made(odd_nets.slip_lanes)))
     past = {("nC-C", "C-W"), ("W-C", "C-sC")}
     turns = [index for index, turn in enumerate(net.turns) if (net.links[turn.link].id, turn.to_edge) in past]
     assert turns

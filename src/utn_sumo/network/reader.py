@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import utn_network
-from utn_sumo.contract import EXIT, Junction, LaneGroup, Link, Network, Stage, Turn
+from utn_sumo.contract import EXIT, SAMPLE_S, Junction, LaneGroup, Link, Network, Stage, Turn
 from utn_sumo.errors import NetworkError, did_you_mean
 from utn_sumo.network import programmes
 from utn_sumo.network.programmes import Block, Phase
@@ -29,6 +29,8 @@ SATURATION_FLOW_VEH_S_LANE = 0.435
 of 0 +- 0.8 veh a cycle, so that what start-up loses the yellow gives back."""
 GIVEN_TURNING_VEH, USUAL_TURNING_VEH = 200.0, 10.0
 """Vehicles that turning fractions are worth which are given, and which are only guessed from the lanes."""
+LEAST_STORAGE_VEH_LANE = SATURATION_FLOW_VEH_S_LANE * SAMPLE_S
+"""What passes in a step of the model: a road that is shorter, amid a junction, holds nobody up by what it stores."""
 STARTUP_LAG_S = 3.0
 """From green to a moving queue, before calibration."""
 
@@ -201,7 +203,7 @@ class _Reader:
             lanes=lanes[-1],
             length_m=length,
             free_speed_m_s=length / sum(edge.getLength() / edge.getSpeed() for edge in edges),
-            storage_veh=max(1.0, lane_m / self.space_m),
+            storage_veh=max(lanes[-1] * LEAST_STORAGE_VEH_LANE, lane_m / self.space_m),
             queue_spacing_m=self.space_m * length / lane_m,
             saturation_flow_veh_s=lanes[-1] * SATURATION_FLOW_VEH_S_LANE,
             is_source=not fed,
