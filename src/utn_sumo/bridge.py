@@ -21,10 +21,10 @@ from utn_sumo import (
     demand,
     metrics,
     monitor,
-    native,
     network,
     recording,
     streets,
+    sumo_signals,
     traffic,
 )
 from utn_sumo.case import SUFFIX, Case
@@ -58,8 +58,8 @@ def run(
 
     A KeyboardInterrupt ends the run early with a whole, readable result that says so. Raises UtnError.
     """
-    if scenario.controller == native.NAME:
-        return native.run(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
+    if alone := sumo_signals.RUNS.get(scenario.controller):
+        return alone(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
     chosen = traffic.given(scenario) if scenario.net.endswith(SUFFIX) else None
     net = network.load(scenario.net) if chosen is None else streets.controllable(chosen)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.

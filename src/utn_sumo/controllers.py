@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -15,6 +16,7 @@ from utn_sumo.errors import ControllerError, SettingError, UtnError, did_you_mea
 from utn_sumo.scenario import explain
 
 GROUP = "utn_sumo.controllers"
+T = TypeVar("T")
 
 
 def registered() -> dict[str, EntryPoint]:
@@ -27,24 +29,32 @@ def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
     factory = _from_file(name) if ".py:" in name else _registered(name)
     if not callable(factory):
         raise ControllerError(f"controller {name!r} is {factory!r}: name a class")
+    controller = made(name, factory, settings, network)
+    if not isinstance(controller, Controller):
+        raise ControllerError(
+            f"controller {name!r} lacks `horizon` or `plan(state, forecast)`: see contract.Controller"
+        )
+    return controller
+
+
+def made(name: str, factory: Callable[..., T], settings: dict[str, Any], *given: Any) -> T:
+    """What the factory of controller `name` makes of its settings, after what else it is given.
+
+    Raises ControllerError or SettingError.
+    """
     takes = settings_of(factory)
     for word in settings:
         if word not in takes:
             rest = did_you_mean(word, takes) if takes else "it takes none"
             raise SettingError(f"controller {name!r} has no setting {word!r}: {rest}")
     try:
-        controller = factory(network, **settings)
+        return factory(*given, **settings)
     except ValidationError as error:
         raise SettingError(f"controller {name!r}: {explain(error, takes)}") from error
     except UtnError:
         raise
     except Exception as error:
         raise ControllerError(f"controller {name!r} can't be built: {_told(error)}") from error
-    if not isinstance(controller, Controller):
-        raise ControllerError(
-            f"controller {name!r} lacks `horizon` or `plan(state, forecast)`: see contract.Controller"
-        )
-    return controller
 
 
 def settings_of(factory: Any) -> list[str]:

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from utn_sumo import metrics, monitor, network, recording, streets, traffic
 from utn_sumo.case import SUFFIX, Case
+from utn_sumo.contract import Network
 from utn_sumo.errors import UtnError
 from utn_sumo.plant import untouched
 from utn_sumo.plant.sumo import records, write_outputs
@@ -19,21 +21,48 @@ from utn_sumo.plant.untouched import Look
 from utn_sumo.scenario import Scenario
 
 NAME = "native"
+PROGRAMMES = "programmes.add.xml"
+"""Signal programmes that stand for the net's own, in a run's folder."""
 
 
 def run(
     scenario: Scenario, folder: Path | None = None, on_look: Callable[[float, float, Look], None] | None = None
 ) -> dict[str, Any]:
-    """Run it and return its measures under the names of SPEC 7; everything else is in the folder.
+    """Run a scenario under the net's own programmes; see `measured`.
 
-    Queues and vehicles are the most on one road. What only our own links have is null; signals are judged as far as
-    we could control them, against the clearances that they show themselves. `on_look` gets
-    the time into the run [s], how long it will be [s] (0 where that is unknown), and how full the roads are. Raises
-    UtnError.
+    Signals are judged as far as we could control them, against the clearances that they show themselves.
+    """
+    chosen = of(scenario)
+    try:
+        judged = streets.controllable(chosen)
+    except UtnError:
+        judged = None
+    return measured(scenario, chosen, judged, folder, on_look)
+
+
+def measured(
+    scenario: Scenario,
+    chosen: Case,
+    judged: Network | None,
+    folder: Path | None,
+    on_look: Callable[[float, float, Look], None] | None,
+    *,
+    programmes: str | None = None,
+) -> dict[str, Any]:
+    """Run a case by SUMO alone and return its measures under the names of SPEC 7; everything else is in the folder.
+
+    `programmes` is the additional file with the signal programmes to show instead of the net's; signals are judged by
+    the rules of the network `judged`. Queues and vehicles are the most on one road. What only our own links have is
+    null. `on_look` gets the time into the run [s], how long it will be [s] (0 where that is unknown), and how full the
+    roads are. Raises UtnError.
     """
     started = time.perf_counter()
-    chosen = of(scenario)
-    folder = recording.new_folder(folder, f"{Path(scenario.net).name.partition('.')[0]}-{NAME}-seed{scenario.seed}")
+    name = f"{Path(scenario.net).name.partition('.')[0]}-{scenario.controller}-seed{scenario.seed}"
+    folder = recording.new_folder(folder, name)
+    if programmes is not None:
+        added = folder / PROGRAMMES
+        added.write_text(programmes, encoding="utf-8")
+        chosen = replace(chosen, additional_files=(*chosen.additional_files, added))
     recording.write_json(
         folder / recording.SETTINGS,
         {"scenario": scenario.model_dump(), "case": chosen.record()},
@@ -48,8 +77,9 @@ def run(
     outcome = untouched.run(
         [*chosen.arguments([outputs]), *records(folder, scenario.seed)], chosen.begin_s, chosen.end_s, look
     )
+    verdict = judged and monitor.watch(judged, folder / "signals.xml", outcome.end_s - chosen.begin_s, chosen.begin_s)
     result = {
-        "controller": NAME,
+        "controller": scenario.controller,
         "net": scenario.net,
         "demand": scenario.demand,
         "seed": scenario.seed,
@@ -60,25 +90,19 @@ def run(
         "over_storage_veh": None,
         "teleports": metrics.teleports(folder / "statistics.xml"),
         "gridlock": None,
-        "unsafe_signal_s": _unsafe_s(chosen, folder, outcome.end_s),
+        "unsafe_signal_s": verdict and verdict.unsafe_signal_s,
         "fallbacks": 0,
         "sumo_time_s": outcome.sumo_time_s,
         "control_time_s": 0.0,
         "bridge_time_s": time.perf_counter() - started - outcome.sumo_time_s,
         "interrupted": outcome.interrupted,
+        "left_alone": dict(judged.left_alone) if judged else {},
+        "unsafe_reasons": verdict.reasons[:20] if verdict else [],
+        "fallback_reasons": [],
         "out": str(folder),
     }
     recording.write_json(folder / recording.RESULT, result)
     return result
-
-
-def _unsafe_s(chosen: Case, folder: Path, end_s: float) -> int | None:
-    """Seconds in which the net's own signals were unsafe; None where there are none that can be judged."""
-    try:
-        net = streets.controllable(chosen)
-    except UtnError:
-        return None
-    return monitor.watch(net, folder / "signals.xml", end_s - chosen.begin_s, chosen.begin_s).unsafe_signal_s
 
 
 def of(scenario: Scenario) -> Case:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-from utn_sumo import case, monitor, native, recording
+from utn_sumo import case, monitor, recording, sumo_signals
 from utn_sumo.case import Case
 from utn_sumo.errors import ResultError
 from utn_sumo.plant.sumo import records, run_arguments
@@ -33,7 +33,7 @@ def write(folder: Path) -> Path:
     try:
         seed, duration_s = int(settings["scenario"]["seed"]), round(result["hours"] * 3600)
         chosen = Case.recorded(settings["case"]) if "case" in settings else None
-        controlled = result["controller"] != native.NAME
+        controlled = result["controller"] not in sumo_signals.RUNS
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ResultError(f"{str(folder)!r} lacks a run's seed or length: give one that `utn run` wrote") from error
     if chosen is not None:

@@ -15,16 +15,17 @@ def named(name: str) -> Network:
     return controllable(case.read(Path(name))) if name.endswith(SUFFIX) else network.load(name)
 
 
-def controllable(chosen: Case) -> Network:
+def controllable(chosen: Case, usual_green_s: float = network.MIN_GREEN_S) -> Network:
     """A net as other people have it, with the signals left alone whose own stages can't be shown safely.
 
-    Raises SettingError for a mesoscopic case, where there are no lanes to watch.
+    A stage for which the net names no least green has `usual_green_s`. Raises SettingError for a mesoscopic case, where
+    there are no lanes to watch.
     """
     if dict(chosen.options).get("mesosim", "false") == "true":
         raise SettingError(
             f"scenario {str(chosen.file)!r} has mesosim, which knows no lanes: leave it out, or use --controller native"
         )
     name, additional, coming = str(chosen.net_file), chosen.additional_files, routes.read(chosen)
-    net = network.load(name, None, additional, coming)
+    net = network.load(name, None, additional, coming, usual_green_s)
     refused = signals.refused(net)
-    return network.load(name, refused, additional, coming) if refused else net
+    return network.load(name, refused, additional, coming, usual_green_s) if refused else net

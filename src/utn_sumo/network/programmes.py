@@ -19,7 +19,7 @@ from utn_sumo.errors import NetworkError
 from utn_sumo.xml_files import opened
 
 MIN_GREEN_S = 10.0
-"""Least green of a stage for which the net names none, if it shows the stage as long itself."""
+"""Usual least green of a stage for which the net names none, if it shows the stage as long itself."""
 SHORTEST_STAGE_S = 5.0
 GREEN, YELLOW, OFF = "Gg", "yYu", "oO"
 SWITCHED_OFF = "its programme switches signals off (o, O)"
@@ -54,10 +54,9 @@ class Block:
     stage: Phase
     clearance: tuple[Phase, ...]
 
-    @property
-    def min_green_s(self) -> float:
-        """Least green of the stage: what the net says, else `MIN_GREEN_S`, but no more than the net itself shows."""
-        wished_s = MIN_GREEN_S if self.stage.least_s is None else self.stage.least_s
+    def min_green_s(self, usual_s: float) -> float:
+        """Least green of the stage: what the net says, else the usual one, but no more than the net itself shows."""
+        wished_s = usual_s if self.stage.least_s is None else self.stage.least_s
         return float(math.ceil(max(1.0, min(wished_s, self.stage.duration_s))))
 
 

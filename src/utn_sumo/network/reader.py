@@ -16,7 +16,7 @@ import utn_network
 from utn_sumo.contract import EXIT, SAMPLE_S, Junction, LaneGroup, Link, Network, Stage, Turn
 from utn_sumo.errors import NetworkError, did_you_mean
 from utn_sumo.network import programmes
-from utn_sumo.network.programmes import Block, Phase
+from utn_sumo.network.programmes import MIN_GREEN_S, Block, Phase
 from utn_sumo.network.roads import Chain, Roads, for_motors, lane_groups, motor_lanes, usual_weight
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
@@ -40,25 +40,26 @@ def load(
     left_alone: Mapping[str, str] | None = None,
     additional: Sequence[Path] = (),
     traffic: Traffic | None = None,
+    usual_green_s: float = MIN_GREEN_S,
 ) -> Network:
     """The shipped network `name`, or the one in the .net.xml file that `name` is a path of.
 
     Signals in `left_alone` keep the net's own programme, for the reason given there. Signal programmes in `additional`
-    files stand for the net's own, the last one read for each signal, as in SUMO.
+    files stand for the net's own, the last one read for each signal, as in SUMO. A stage for which the net names no
+    least green has `usual_green_s`.
 
     Turning fractions are read from NAME.turns.xml beside the net (SUMO's edgeRelations), else counted in the `traffic`
     that will drive here, if that is known; else every lane-to-lane connection of a link is taken to carry the same
     share. What room a vehicle takes is the traffic's too.
     """
     if name in utn_network.names():
-        return read(utn_network.net_file(name), name)
+        return read(utn_network.net_file(name), name, usual_green_s=usual_green_s)
     path = Path(name)
     if not path.is_file():
         known = did_you_mean(name, utn_network.names())
         raise NetworkError(f"net {name!r}: neither a shipped net nor a file; {known}")
-    return read(
-        path, path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net"), left_alone, additional, traffic
-    )
+    stem = path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net")
+    return read(path, stem, left_alone, additional, traffic, usual_green_s=usual_green_s)
 
 
 def read(
@@ -67,6 +68,8 @@ def read(
     excluded: Mapping[str, str] | None = None,
     additional: Sequence[Path] = (),
     traffic: Traffic | None = None,
+    *,
+    usual_green_s: float = MIN_GREEN_S,
 ) -> Network:
     """Read one net file. Raises NetworkError with one line if it can't be used."""
     import sumolib  # noqa: PLC0415 - heavy, and only this door needs it
@@ -97,7 +100,7 @@ def read(
     if not controlled:
         reasons = "; ".join(f"{signal}: {reason}" for signal, reason in left_alone.items())
         raise NetworkError(f"net {str(path)!r} has no signals that can be controlled ({reasons})")
-    reader = _Reader(net, controlled, _read_fractions(path), traffic)
+    reader = _Reader(net, controlled, _read_fractions(path), traffic, usual_green_s)
     return reader.network(path.resolve(), name, left_alone)
 
 
@@ -137,11 +140,17 @@ class _Reader:
     """Builds the index spaces in the order links, turns, lane groups, stages, junctions."""
 
     def __init__(
-        self, net: Any, signals: Sequence[Signal], fractions: Mapping[tuple[str, str], float], traffic: Traffic | None
+        self,
+        net: Any,
+        signals: Sequence[Signal],
+        fractions: Mapping[tuple[str, str], float],
+        traffic: Traffic | None,
+        usual_green_s: float,
     ):
         self.net = net
         self.signals = signals
         self.fractions = fractions
+        self.usual_green_s = usual_green_s
         self.coming_veh = None if traffic is None else _coming_veh(net, traffic)
         self.space_m = SPACE_PER_VEHICLE_M if traffic is None else traffic.space_m
         # Approach edge -> position of the junction that it enters.
@@ -164,7 +173,7 @@ class _Reader:
             assert programme is not None
             signal_turns = self._signal_turns(signal, turn_index)
             first = len(stages)
-            stages += [_stage(block, position, signal_turns) for block in programme.blocks]
+            stages += [_stage(block, position, signal_turns, self.usual_green_s) for block in programme.blocks]
             junctions.append(
                 Junction(
                     id=signal.id,
@@ -280,7 +289,7 @@ def _coming_veh(net: Any, traffic: Traffic) -> dict[tuple[str, str], float]:
     return total
 
 
-def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]]) -> Stage:
+def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]], usual_green_s: float) -> Stage:
     """A stage of a junction, with the turns that it and each part of its clearance open."""
 
     def served(phase: Phase) -> tuple[int, ...]:
@@ -291,7 +300,7 @@ def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]]) -
         state=block.stage.state,
         clearance=tuple((phase.state, phase.duration_s) for phase in block.clearance),
         turns=served(block.stage),
-        min_green_s=block.min_green_s,
+        min_green_s=block.min_green_s(usual_green_s),
         held=tuple(served(phase) for phase in block.clearance),
     )
 
