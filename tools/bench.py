@@ -166,7 +166,7 @@ def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, 
                     f"{statistics.median(spent.values()):.0f}",
                     f"{statistics.median(first.values()) / (statistics.median(spent.values()) or math.nan):.3f}",
                     f"{min(ratios):.3f}-{max(ratios):.3f}",
-                    str(sum(r["gridlock"] for r in runs)),
+                    "not known" if runs[0]["gridlock"] is None else str(sum(r["gridlock"] for r in runs)),
                     str(alarms),
                 ]
             )

@@ -126,14 +126,14 @@ class _Guard:
         self.verdict = verdict
         self.rules = _Rules.of(network, junction)
         self.under_way = (junction.offset_s - begin_s) % junction.cycle_s > 0
-        """Whether a cycle is under way when the run begins: how long its green has lasted nobody saw."""
+        """Whether a cycle is under way when the run begins: how long its green or yellow has lasted nobody saw."""
         last = network.stages[junction.stages[-1]]
         self.ends = last.clearance[-1][0] if last.clearance else last.state
         """What a cycle ends with: nor did anybody see how long a green has lasted that goes on round it."""
         size = len(junction.conflicts)
         self.foes = [[b for b in range(size) if junction.conflicts[a][b]] for a in range(size)]
         self.green_since = [0] * size
-        self.yellow_since = [0] * size
+        self.yellow_since = [LONG_AGO_S if self.under_way else 0] * size
         self.last_green = [LONG_AGO_S] * size
         self.protected = [False] * size
         """Whether a signal has its protected green, or the yellow that clears it."""

@@ -59,7 +59,7 @@ class DelayBased(Peer):
     """Time that a vehicle must have lost to prolong a green: SUMO's default."""
 
     def programmes(self, network: Network, chosen: Case) -> tuple[Network, list[ET.Element]]:
-        seen = {"detectorRange": self.detector_range_m, "minTimeLoss": self.min_time_loss_s}
+        seen = {"detectorRange": self.detector_range_m, "minTimeloss": self.min_time_loss_s}
         return network, _responsive(network, "delay_based", chosen.begin_s, self.max_green_s, seen)
 
 

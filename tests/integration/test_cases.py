@@ -198,7 +198,7 @@ CLASH = [(60, "GGGGGG"), (3, "yyyyyy"), (50, "rrrGGG"), (7, "rrryyy")]
 
 
 @pytest.mark.parametrize("stopped_after", [None, 4], ids=["whole", "stopped early"])
-@pytest.mark.parametrize("controller", ["native", "fixed"])
+@pytest.mark.parametrize("controller", ["native", "fixed", "actuated"])
 def test_bare_sumo_replays_its_runs_vehicle_for_vehicle(
     town: Path, tmp_path: Path, controller: str, stopped_after: int | None
 ) -> None:

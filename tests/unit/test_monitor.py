@@ -44,6 +44,17 @@ def judge(net: Network, record: Path, first: Phases | None = None, plan: Plan | 
     return monitor.watch(net, record, DURATION_S)
 
 
+def test_a_yellow_that_was_under_way_when_the_run_began_is_taken_to_have_been_long_enough(
+    utn17: Network, record: Path
+) -> None:
+    rest: Phases = [(YELLOW, 1), (RED, 2), (SECOND, 35), (RED, 202)]
+    shifted = replace(utn17, junctions=tuple(replace(each, offset_s=83.0) for each in utn17.junctions))
+    amid = [reason for reason in judge(shifted, record, rest).reasons if reason.startswith("J1 at 1 s")]
+    fresh = [reason for reason in judge(utn17, record, rest).reasons if reason.startswith("J1 at 1 s")]
+    assert amid == []
+    assert "too little yellow" in fresh[0]
+
+
 @given(weights=st.lists(st.floats(0, 1), min_size=17, max_size=17))
 def test_whatever_plan_is_admitted_is_shown_without_an_unsafe_second(
     utn17: Network, record: Path, weights: list[float]
