@@ -18,6 +18,7 @@ from utn_sumo import case, signals, sumo_tools
 from utn_sumo.case import Case
 from utn_sumo.contract import Floats, Network
 from utn_sumo.errors import PlantError
+from utn_sumo.routes import WHENEVER
 from utn_sumo.xml_files import opened
 
 HOUR_S = 3600.0
@@ -100,8 +101,8 @@ def _busiest_hour(chosen: Case, routes: Path, headway_s: float) -> tuple[float, 
     The tool multiplies the flow of a part of an hour by one and the missing part, where it should divide it by what
     is there. A flow too small by some factor under a headway too long by it is the same load.
     """
-    vehicles = (each for each in case.elements(routes) if each.tag == "vehicle")
-    departs_s = np.sort([case.seconds(vehicle.attrib["depart"]) for vehicle in vehicles])
+    departs = [each.attrib["depart"] for each in case.elements(routes) if each.tag == "vehicle"]
+    departs_s = np.sort([case.seconds(depart) for depart in departs if depart not in WHENEVER])
     if not departs_s.size:
         raise PlantError(f"scenario {str(chosen.file)!r} has no vehicles to time signals by: use another controller")
     busiest = int(np.argmax(np.searchsorted(departs_s, departs_s + HOUR_S) - np.arange(departs_s.size)))

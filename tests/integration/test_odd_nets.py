@@ -16,9 +16,10 @@ from click.testing import CliRunner
 
 from utn_sumo import bridge, case, inspection, monitor, streets
 from utn_sumo.cli import cli
-from utn_sumo.errors import UtnError
+from utn_sumo.errors import PlantError, UtnError
 from utn_sumo.plant.sumo import PROGRAM
 from utn_sumo.scenario import scenario
+from utn_sumo.sumo_signals import PEERS
 from utn_sumo.sumo_tools import sumo_binary
 
 from . import odd_nets
@@ -45,6 +46,12 @@ EITHER = {
     odd_nets.fraction_in_the_cycle,
 }
 """Where it may be left alone as well, if the reason is named."""
+BREAKS_OFF = {
+    (odd_nets.letters_without_a_stream, "webster"),
+    (odd_nets.letters_without_a_stream, "webster+offsets"),
+    (odd_nets.switched_off, "webster+offsets"),
+}
+"""Where SUMO's own tools do."""
 UNSTEADY = {odd_nets.bicycle_lanes}
 """Where SUMO's own trips depend on where in memory things lie: libsumo gives others the second time, with one seed."""
 NEAR_VEH = 4
@@ -193,6 +200,20 @@ def gaps_s(seen: Shown) -> dict[tuple[int, int], float]:
             if begun:
                 break
     return found
+
+
+@pytest.mark.long
+@every_case
+@pytest.mark.parametrize("controller", PEERS)
+def test_sumo_s_own_signals_are_safe_or_its_tool_is_named(make: Make, controller: str, ran: Run) -> None:
+    if (make, controller) in BREAKS_OFF:
+        with pytest.raises(PlantError, match=r"SUMO's tls\w+.py broke off .*use another controller"):
+            ran(make, controller)
+        return
+    result, _ = ran(make, controller)
+    assert (result["unsafe_signal_s"], result["unsafe_reasons"]) == (0, [])
+    assert result["arrived"] > 0
+    assert LEFT_ALONE.get(make, set()) <= set(result["left_alone"])
 
 
 @every_case
