@@ -70,8 +70,8 @@ class Webster(Peer):
     """The tool's own least is 20 s, too short for most nets."""
     max_cycle_s: int = Field(120, ge=1, le=3600)
     lost_time_s: int = Field(6, ge=0, le=60)
-    """Of a stage, by start-up and clearance. The tool's 4 s make cycles too short: with 6 s there is up to 29 % less delay
-    on `utn17`, cologne8 and ingolstadt7."""
+    """Of a stage, by start-up and clearance. The tool's 4 s make cycles too short: with 6 s there is up to 29 % less
+    delay on `utn17`, cologne8 and ingolstadt7."""
     headway_s: float = Field(2.0, gt=0, le=60)
     """Between vehicles that leave a queue on one lane: the tool's default."""
 
