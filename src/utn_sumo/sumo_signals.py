@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from xml.etree import ElementTree as ET  # only to write
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -66,6 +66,8 @@ class DelayBased(Peer):
 class Webster(Peer):
     """Fixed programmes by SUMO's tlsCycleAdaptation.py: Webster's cycles and splits for the busiest hour's flows."""
 
+    coordinated: ClassVar[bool] = False
+
     min_cycle_s: int = Field(50, ge=1, le=3600)
     """The tool's own least is 20 s, too short for most nets."""
     max_cycle_s: int = Field(120, ge=1, le=3600)
@@ -82,19 +84,15 @@ class Webster(Peer):
         return self
 
     def programmes(self, network: Network, chosen: Case) -> tuple[Network, list[ET.Element]]:
-        return self._timed(network, chosen, coordinated=False)
-
-    def _timed(self, network: Network, chosen: Case, *, coordinated: bool) -> tuple[Network, list[ET.Element]]:
         wanted = webster.Wanted(**self.model_dump())
-        network, green_s = webster.timed(network, chosen, wanted, coordinated=coordinated)
+        network, green_s = webster.timed(network, chosen, wanted, coordinated=self.coordinated)
         return network, webster.fixed(network, green_s)
 
 
 class CoordinatedWebster(Webster):
     """Webster's splits in one cycle for all, with offsets by SUMO's tlsCoordinator.py."""
 
-    def programmes(self, network: Network, chosen: Case) -> tuple[Network, list[ET.Element]]:
-        return self._timed(network, chosen, coordinated=True)
+    coordinated: ClassVar[bool] = True
 
 
 PEERS: Mapping[str, type[Peer]] = {
