@@ -29,7 +29,7 @@ FILES = {
 }
 # name: (arguments, what the line names, the remedy that it gives)
 MISTAKES: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "unknown controller": (("run", "--controller", "dpmc"), "'dpmc'", "did you mean 'dmpc'? known: cmpc, dmpc, fixed"),
+    "unknown controller": (("run", "--controller", "dpmc"), "'dpmc'", "did you mean 'dmpc'? known: "),
     "controller in no file": (("run", "--controller", "none.py:Own"), "'none.py:Own'", "there is no file"),
     "controller of another name": (("run", "--controller", "lacks.py:Other"), "'Other'", "has no class"),
     "controller with a syntax error": (("run", "--controller", "text.py:Own"), "text.py:Own", "line 2"),
