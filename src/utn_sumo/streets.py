@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from utn_sumo import case, network, routes, signals
@@ -18,6 +19,8 @@ def named(name: str) -> Network:
 def controllable(chosen: Case) -> Network:
     """A net as other people have it, with the signals left alone whose own stages can't be shown safely.
 
+    Offsets count from the begin of the case's window.
+
     Raises SettingError for a mesoscopic case, where there are no lanes to watch.
     """
     if dict(chosen.options).get("mesosim", "false") == "true":
@@ -27,4 +30,8 @@ def controllable(chosen: Case) -> Network:
     name, additional, coming = str(chosen.net_file), chosen.additional_files, routes.read(chosen)
     net = network.load(name, None, additional, coming)
     refused = signals.refused(net)
-    return network.load(name, refused, additional, coming) if refused else net
+    if refused:
+        net = network.load(name, refused, additional, coming)
+    # Our clock begins where the window does.
+    junctions = (replace(each, offset_s=(each.offset_s - chosen.begin_s) % each.cycle_s) for each in net.junctions)
+    return replace(net, junctions=tuple(junctions))

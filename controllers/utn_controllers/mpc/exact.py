@@ -217,7 +217,7 @@ def smooth_windows(model: LinkModel, green_s: Any, begin_s: float) -> tuple[Any,
     lasts = ops.matmul(sp.csr_array(own * ~follows[:, None]), green_s) + lasts_s
     shown: Any = 0
     last: Any = 0
-    for cycle_start_s in net.cycle_starts_s[:, stage]:
+    for cycle_start_s in net.cycle_starts_s()[:, stage]:
         opens = since + cycle_start_s
         closes = ops.minimum(opens + lasts, model.step_s)
         overlap = ops.maximum(closes - ops.maximum(opens, 0.0), 0.0)

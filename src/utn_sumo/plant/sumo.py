@@ -70,7 +70,7 @@ class SumoPlant:
         self._ids = detectors.ids(network)
         self._entered: list[tuple[float, Floats]] = []
         """(time, what the entry loops have counted since the control step began) at each reading."""
-        self._boundary_s = [(junction.offset_s - self.begin_s) % junction.cycle_s for junction in network.junctions]
+        self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
         self._sumo: Any = None
         self._places: dict[str, list[tuple[Any, str]]] = {}
         """Of each edge what SUMO counts its motor vehicles by: the edge as a whole, or some of its lanes."""
