@@ -128,7 +128,7 @@ def _is_remnant(phase: Phase, before: Phase) -> bool:
 def own(tls: Any) -> Programme | None:
     """The net's own programme of a signal (a sumolib TLS), if it has one."""
     program = next(iter(tls.getPrograms().values()), None)
-    if program is None:
+    if program is None or not program.getPhases():
         return None
     phases = (
         Phase(phase.state, float(phase.duration), float(phase.minDur) if phase.minDur >= 0 else None, bool(phase.next))
@@ -178,8 +178,9 @@ def _elements(file: Path, tag: str) -> list[Any]:
 
 
 def _phase(element: Any) -> Phase:
-    least = element.get("minDur")
-    return Phase(element.get("state", ""), float(element.get("duration", "")), None if least is None else float(least))
+    least, elsewhere = element.get("minDur"), bool((element.get("next") or "").strip())
+    duration_s = float(element.get("duration", ""))
+    return Phase(element.get("state", ""), duration_s, None if least is None else float(least), elsewhere)
 
 
 def why_left_alone(programme: Programme | None, signals: int) -> str:
