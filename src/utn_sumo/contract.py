@@ -284,13 +284,18 @@ class Network:
 
     @cached_property
     def cycle_starts_s(self) -> Floats:
-        """(R, S) starts of the cycles of each stage's junction in a control step, the one under way at 0 first."""
+        """(R, S) starts of the cycles of each stage's junction in a control step, the one under way at 0 first.
+
+        Under way is what still moves then: it starts and ends `startup_lag_s` after its signals.
+        """
         cycle_s, offset_s = (
             np.array([getattr(junction, name) for junction in self.junctions])[self.stage_junction]
             for name in ("cycle_s", "offset_s")
         )
         repeats = np.arange(-1, int(np.ceil(self.control_step_s / cycle_s.min())))
-        return np.asarray(offset_s % cycle_s + repeats[:, None] * cycle_s)
+        first_s = offset_s % cycle_s
+        first_s = np.where(first_s + self.startup_lag_s > cycle_s, first_s - cycle_s, first_s)
+        return np.asarray(first_s + repeats[:, None] * cycle_s)
 
     def since_cycle_start_s(self, green_s: Floats) -> Floats:
         """(..., S) from the start of its junction's cycle to each stage's green, under the plan `green_s` (..., S)."""

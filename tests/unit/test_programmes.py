@@ -135,9 +135,7 @@ def test_stages_and_clearances_laid_end_to_end_show_the_programme_letter_for_let
     assert found.cycle_s == cycle_s
     if not found.opens:
         return
-    laid = [
-        (phase.state, phase.duration_s) for block in found.blocks for phase in (block.stage, *block.clearance)
-    ]
+    laid = [(phase.state, phase.duration_s) for block in found.blocks for phase in (block.stage, *block.clearance)]
     begins_s = found.offset_s + found.begin_s
     assert sum(seconds for _, seconds in laid) == cycle_s
     for second in range(-cycle_s, 2 * cycle_s):

@@ -15,13 +15,12 @@ import sumolib
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.integration import odd_nets
+from tests.integration.odd_nets import ARM_M, NO_TURNAROUNDS, TWO_STAGES, Streets, retime, row, tl_logic
 from utn_sumo.contract import EXIT, Link, Network
 from utn_sumo.network import MOTOR, roads
 from utn_sumo.network.roads import lane_groups
 from utn_sumo.sumo_tools import sumo_binary
-
-from tests.integration import odd_nets
-from tests.integration.odd_nets import ARM_M, NO_TURNAROUNDS, TWO_STAGES, Streets, retime, row, tl_logic
 
 Make = Callable[[Path], Any]
 StreetOf = Callable[[Make], Network]
@@ -78,9 +77,7 @@ def test_a_link_adds_up_the_lengths_times_and_lanes_of_its_edges(street_of: Stre
     assert found.storage_veh * found.queue_spacing_m == pytest.approx(found.length_m)
 
 
-def test_side_streets_join_and_part_on_the_lanes_that_they_meet_the_road_by(
-    street_of: StreetOf, net_of: NetOf
-) -> None:
+def test_side_streets_join_and_part_on_the_lanes_that_they_meet_the_road_by(street_of: StreetOf, net_of: NetOf) -> None:
     found = link(street_of(odd_nets.side_streets), "u-B")
     assert found.edges == ("A-t", "t-u", "u-B")
     via = via_lanes(net_of(odd_nets.side_streets))
@@ -243,10 +240,20 @@ def test_who_is_counted_at_inner_nodes_is_everybody_who_does_not_go_along(
     net, via = street_of(town), via_lanes(net_of(town))
     for each in net.links:
         along = set(pairwise(each.edges))
-        joins = [lanes for (start, end), lanes in via.items() if end in each.edges[1:] and (start, end) not in along]
-        parts = [lanes for (start, end), lanes in via.items() if start in each.edges[:-1] and (start, end) not in along]
-        assert list(each.joining) == sorted(sum(joins, []))
-        assert list(each.parting) == sorted(sum(parts, []))
+        joins = [
+            lane
+            for (start, end), lanes in via.items()
+            if end in each.edges[1:] and (start, end) not in along
+            for lane in lanes
+        ]
+        parts = [
+            lane
+            for (start, end), lanes in via.items()
+            if start in each.edges[:-1] and (start, end) not in along
+            for lane in lanes
+        ]
+        assert list(each.joining) == sorted(joins)
+        assert list(each.parting) == sorted(parts)
 
 
 @every_town
@@ -265,12 +272,15 @@ def test_lane_groups_share_out_the_lanes_that_lead_on(town: Make, street_of: Str
     net, drawn = street_of(town), sumolib.net.readNet(str(net_of(town)))
     assert sorted(net.group_link) == list(net.group_link)
     for index, each in enumerate(net.links):
+        ahead = drawn.getEdge(each.id).getOutgoing()
         groups = [group for group in net.groups if group.link == index]
         lanes = [lane for group in groups for lane in group.lanes]
-        leading = {c.getFromLane().getIndex() for cs in drawn.getEdge(each.id).getOutgoing().values() for c in cs}
+        leading = {c.getFromLane().getIndex() for cs in ahead.values() for c in cs}
         assert sorted(lanes) == sorted(leading)
         for turn in (turn for turn in net.turns if turn.link == index):
-            used = {c.getFromLane().getIndex() for c in drawn.getEdge(each.id).getOutgoing()[drawn.getEdge(turn.to_edge)]}
+            used = {
+                c.getFromLane().getIndex() for c in drawn.getEdge(each.id).getOutgoing()[drawn.getEdge(turn.to_edge)]
+            }
             assert used <= set(net.groups[turn.group].lanes)
     by_link = np.bincount(net.group_link, net.group_saturation_flow_veh_s)
     assert (by_link <= net.saturation_flow_veh_s + 1e-9).all()

@@ -74,8 +74,7 @@ def fastest_s(times: dict[str, dict[str, float]], origin: str) -> dict[str, floa
 
 def along(turned: Turned, here: str) -> list[str]:
     """The edges of one vehicle's turns, in order."""
-    onward = dict(turned)
-    ahead = {start: end for start, end in onward}
+    ahead = dict(turned.keys())
     way = [here]
     while way[-1] in ahead:
         way.append(ahead[way[-1]])
