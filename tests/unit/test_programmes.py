@@ -213,6 +213,20 @@ def test_a_programme_of_an_additional_file_whose_phases_name_their_successors_is
     assert "next" in programmes.why_left_alone(found, 2)
 
 
+def test_what_an_additional_file_includes_stands_where_it_is_included(tmp_path: Path) -> None:
+    off, on = '<tlLogic id="A" type="static" programID="off"/>', logic("B", 'duration="20" state="Gr"')
+    (tmp_path / "sub").mkdir()
+    written(tmp_path / "sub", off, on)
+    said = '<include href="sub/signals.add.xml"/>'
+    before, after = logic("B", 'duration="30" state="rG"'), logic("A", 'duration="30" state="rG"')
+    file = written(tmp_path, before, said)
+    assert programmes.added([file])["B"].phases == (Phase("Gr", 20),)
+    assert set(programmes.switched_elsewhere([file])) == {"A"}
+    file = written(tmp_path, said, before, after)
+    assert programmes.added([file])["B"].phases == (Phase("rG", 30),)
+    assert not programmes.switched_elsewhere([file])
+
+
 @pytest.mark.parametrize("said", ['duration="soon" state="Gr"', 'state="Gr"', 'duration="9" state="Gr" minDur="x"'])
 def test_times_that_are_no_numbers_are_refused_in_one_line(tmp_path: Path, said: str) -> None:
     with pytest.raises(NetworkError, match="no numbers") as caught:

@@ -9,7 +9,7 @@ seconds is never a stage: nobody could use it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -170,11 +170,17 @@ def switched_elsewhere(files: Sequence[Path]) -> dict[str, str]:
     return found
 
 
-def _elements(file: Path, tag: str) -> list[Any]:
+def _elements(file: Path, tag: str) -> Iterator[Any]:
+    """Of an additional file, those of files that it includes where these stand."""
     from defusedxml import ElementTree  # noqa: PLC0415
 
     with opened(file) as content:
-        return list(ElementTree.parse(content).iter(tag))
+        every = ElementTree.parse(content)
+    for element in every.iter():
+        if element.tag == "include":
+            yield from _elements(file.parent / element.get("href", ""), tag)
+        elif element.tag == tag:
+            yield element
 
 
 def _phase(element: Any) -> Phase:
