@@ -7,8 +7,10 @@
     python tools/bench.py estimate     vehicles estimated from loops that miscount: counting against the filter
     python tools/bench.py forecast     STARIMA: time to fit, and to update and forecast each cycle
     python tools/bench.py foresight    what forecasts are worth in closed loop, against perfect ones
+    python tools/bench.py scenarios    controllers on other people's scenarios: mean delay by seed
+    python tools/bench.py scale        a net of 1,000 signals: time to read it, and to step its model
 
-Each prints a table, or with --json one object (traffic, step, estimate and foresight: a list of objects).
+Each prints a table, or with --json one object (traffic, step, estimate, foresight and scenarios: a list of objects).
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from rich.console import Console
 from rich.table import Table
 
 import forecasting
+import foreign
 import solving
 from utn_sumo import bridge, calibration, mismatch, network, recording, replay, sumo_tools
 from utn_sumo.contract import Measurement
@@ -342,6 +345,50 @@ def foresight(forecasts: str, demands: str, noises: str, seeds: str, *, as_json:
             for each in found
         ],
     )
+
+
+@bench.command()
+@click.argument("files", nargs=-1, required=True)
+@click.option("--controllers", default="native,fixed,cmpc,dmpc", show_default=True)
+@click.option("--seeds", default="1,2,3", show_default=True)
+@click.option("--workers", default=2, show_default=True)
+@click.option("--json", "as_json", is_flag=True)
+def scenarios(files: tuple[str, ...], controllers: str, seeds: str, workers: int, as_json: bool) -> None:
+    """Controllers on the .sumocfg FILES, each over its own window: mean delay, and what must not happen."""
+    found = foreign.delays(files, controllers.split(","), [int(seed) for seed in seeds.split(",")], workers)
+    if as_json:
+        click.echo(json.dumps(found))
+        return
+    rows = [
+        [
+            Path(each["net"]).parent.name,
+            each["controller"],
+            " ".join(f"{delay:.1f}" for delay in each["mean_delay_s"]),
+            f"{statistics.mean(each['mean_delay_s']):.1f}",
+            str(sum(each["unsafe_signal_s"])),
+            str(sum(each["fallbacks"])),
+            f"{statistics.mean(each['control_time_s']) / statistics.mean(each['sumo_time_s']):.2f}",
+            ", ".join(each["left_alone"]) or "none",
+        ]
+        for each in found
+    ]
+    heads = ["scenario", "controller", "delay by seed (s)", "mean", "unsafe (s)", "fallbacks", "control / SUMO"]
+    _show(f"mean delay, seeds {seeds}", [*heads, "left alone"], rows)
+    for reason in (reason for each in found for reason in each["fallback_reasons"]):
+        click.echo(f"fallback: {reason}")
+
+
+@bench.command()
+@click.option("--side", default=32, show_default=True, help="Signals along each side of the grid.")
+@click.option("--json", "as_json", is_flag=True)
+def scale(side: int, as_json: bool) -> None:
+    """Time to read a netgenerate grid of side x side signals, and to step its model."""
+    found = foreign.scale(side)
+    if as_json:
+        click.echo(json.dumps(found))
+        return
+    rows = [[name, f"{value:.3g}" if isinstance(value, float) else str(value)] for name, value in found.items()]
+    _show(f"netgenerate grid of {side} x {side} signals", ["", ""], rows)
 
 
 def _traffic_job(job: dict[str, Any]) -> dict[str, Any]:

@@ -27,9 +27,15 @@ def _junction(network: Network, index: int, refused: Mapping[str, str]) -> dict[
         "id": junction.id,
         "cycle_s": junction.cycle_s,
         "offset_s": junction.offset_s,
-        "stages": len(junction.stages),
+        "stages": [
+            {
+                "state": stage.state,
+                "min_green_s": stage.min_green_s,
+                "clearance": [{"state": state, "duration_s": seconds} for state, seconds in stage.clearance],
+            }
+            for stage in part.stages
+        ],
         "green_budget_s": float(part.green_budget_s[0]),
-        "min_green_s": part.min_green_s.tolist(),
         "links": [link.id for link in part.links],
         "refused": refused.get(junction.id, ""),
     }
@@ -38,6 +44,7 @@ def _junction(network: Network, index: int, refused: Mapping[str, str]) -> dict[
 def _link(network: Network, index: int) -> dict[str, Any]:
     link = network.links[index]
     turns = [turn for turn in network.turns if turn.link == index]
+    groups = sorted({turn.group for turn in turns})
     return {
         "id": link.id,
         "junction": network.junctions[link.junction].id,
@@ -48,6 +55,14 @@ def _link(network: Network, index: int) -> dict[str, Any]:
         "storage_veh": link.storage_veh,
         "saturation_flow_veh_h": 3600 * link.saturation_flow_veh_s,
         "is_source": link.is_source,
+        "side_roads": {"joining": len(link.joining), "parting": len(link.parting)},
+        "lane_groups": [
+            {
+                "lanes": list(network.groups[group].lanes),
+                "turns": [turn.to_edge for turn in turns if turn.group == group],
+            }
+            for group in groups
+        ],
         "turns": {
             turn.to_edge: {
                 "next_link": None if turn.next_link == EXIT else network.links[turn.next_link].id,

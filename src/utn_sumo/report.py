@@ -201,7 +201,8 @@ def inspection_table(found: dict[str, Any], folder: Path) -> None:
     for head in ("junction", "cycle (s)", "offset (s)", "stages", "green to share (s)", "links", "controlled"):
         view.add_column(head)
     for each in found["junctions"]:
-        numbers = [f"{each[key]:g}" for key in ("cycle_s", "offset_s", "stages", "green_budget_s")]
+        numbers = [f"{each[key]:g}" for key in ("cycle_s", "offset_s")]
+        numbers += [str(len(each["stages"])), f"{each['green_budget_s']:g}"]
         view.add_row(
             each["id"], *numbers, ", ".join(each["links"]), f"no: {each['refused']}" if each["refused"] else "yes"
         )
@@ -209,12 +210,23 @@ def inspection_table(found: dict[str, Any], folder: Path) -> None:
         view.add_row(signal, "", "", "", "", "", f"no: {reason}")
     console.print(view)
     view = Table()
-    for head in ("link", "to", "lanes", "length (m)", "storage (veh)", "saturation (veh/h)", "source", "turns: share"):
+    for head in (
+        "link",
+        "to",
+        "lanes",
+        "length (m)",
+        "storage (veh)",
+        "saturation (veh/h)",
+        "source",
+        "turns: share, by lane group",
+    ):
         view.add_column(head)
     for each in found["links"]:
-        turns = ", ".join(
-            f"{turn['next_link'] or 'exit ' + edge}: {turn['fraction']:.2f}" for edge, turn in each["turns"].items()
-        )
+        shares = {
+            edge: f"{turn['next_link'] or 'exit ' + edge}: {turn['fraction']:.2f}"
+            for edge, turn in each["turns"].items()
+        }
+        turns = " | ".join(", ".join(shares[edge] for edge in group["turns"]) for group in each["lane_groups"])
         numbers = [f"{each[key]:.0f}" for key in ("lanes", "length_m", "storage_veh", "saturation_flow_veh_h")]
         view.add_row(each["id"], each["junction"], *numbers, "yes" if each["is_source"] else "", turns)
     console.print(view)
