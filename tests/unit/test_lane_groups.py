@@ -219,6 +219,16 @@ def test_who_parts_onto_another_link_amid_it_is_in_one_place_only(sides: Network
     assert [state.x_veh[[there, back]].tolist() for state in states] == [[10, 10], [6, 14]]
 
 
+def test_who_came_on_amid_a_link_is_there_though_not_in_view_and_no_ghost_for_long(sides: Network) -> None:
+    estimator, nobody = Estimator(sides, sides, disturbance_veh=4.0), np.zeros(len(sides.links))
+    index, beside = sides.link_index("u-B"), nobody.copy()
+    beside[index] = 20.0
+    assert estimator.update(counted(sides, beside_veh=beside), nobody).x_veh[index] > 15
+    for _ in range(3):
+        state = estimator.update(counted(sides), nobody)
+    assert state.x_veh[index] < 2
+
+
 def test_side_roads_mend_with_what_is_seen_where_loops_miscount(sides: Network) -> None:
     estimator, links = Estimator(sides, sides, loop_error=0.05), np.zeros(len(sides.links))
     has_sides = np.array([bool(link.joining) for link in sides.links])
