@@ -292,15 +292,17 @@ class Network:
     def cycle_starts_s(self, time_s: Floats | float = 0.0) -> Floats:
         """(..., R, S) starts of the cycles of each stage's junction, counted from the times `time_s` (...).
 
-        As many as may show in a control step that begins then, the one under way first.
+        As many as may show in a control step that begins then, the one under way first. Under way is what still moves:
+        it starts and ends `startup_lag_s` after its signals.
         """
         cycle_s, offset_s = (
             np.array([getattr(junction, name) for junction in self.junctions])[self.stage_junction]
             for name in ("cycle_s", "offset_s")
         )
         repeats = np.arange(-1, int(np.ceil(self.control_step_s / cycle_s.min())))
-        first = (offset_s - np.asarray(time_s)[..., None]) % cycle_s
-        return np.asarray(first[..., None, :] + repeats[:, None] * cycle_s)
+        first_s = (offset_s - np.asarray(time_s)[..., None]) % cycle_s
+        first_s = np.where(first_s + self.startup_lag_s > cycle_s, first_s - cycle_s, first_s)
+        return np.asarray(first_s[..., None, :] + repeats[:, None] * cycle_s)
 
     def since_cycle_start_s(self, green_s: Floats) -> Floats:
         """(..., S) from the start of its junction's cycle to each stage's green, under the plan `green_s` (..., S)."""

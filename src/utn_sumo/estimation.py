@@ -121,6 +121,8 @@ class Estimator:
         crowd = (seen.seen_veh / self._watched_veh - QUIET_SHARE) / (CROWDED_SHARE - QUIET_SHARE)
         quiet = crowd < 1
         variance = SEEN_SD_VEH**2 + (SEEN_SD_SHARE * hidden) ** 2 + (CROWDED_SD_VEH * np.maximum(crowd, 0.0)) ** 2
+        # Where side roads meet a link before what is watched of it, who came there may not be in view yet.
+        variance = variance + np.where(self._watched_veh < self.network.storage_veh, seen.beside_veh, 0.0) ** 2
         gain = quiet[:, None] * covariance[:, :, 0] / (covariance[:, 0, 0] + variance)[:, None]
         residual = seen.seen_veh + hidden - x
         self._covariance = covariance - gain[:, :, None] * covariance[:, None, 0, :]
