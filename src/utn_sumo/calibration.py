@@ -31,7 +31,7 @@ FITTED = {"saturation_flow_veh_s": 0.2, "storage_veh": 0.1, "queue_spacing_m": 0
 """Parameters of a link, and their relative standard deviation about what the network's links have in common: a link
 that never saturates or fills is taken to be like the others. The road's length settles most of the storage."""
 WAITING_VEH, WAITING_STEPS = 3.0, 8
-"""Vehicles that wait outside all through a step in which an entry is taken to be used in full, and such steps needed."""
+"""Vehicles that wait outside all through a step whose entry is taken to be used in full, and how many such steps."""
 COMMON_SHARE = 0.3
 """Standard deviation of what the links have in common about what the net says, relative."""
 LAG_PRIOR_S = 2.0

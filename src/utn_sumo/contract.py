@@ -456,6 +456,8 @@ class Measurement:
     """(Z,) standing in the lane-area detectors at the end."""
     group_queue_veh: Floats
     """(G,) of these, who stands on the lanes of each lane group."""
+    group_seen_veh: Floats
+    """(G,) in the lane-area detectors on the lanes of each lane group at the end, moving or not."""
     beside_veh: Floats
     """(Z,) counted onto the link amid it over the loops at side roads, less those counted off it."""
     seen_veh: Floats

@@ -120,7 +120,15 @@ def counted(net: Network, **readings: Floats) -> Measurement:
         ("queue_veh", "seen_veh", "beside_veh", "entry_occupancy", "stop_line_occupancy"), links
     )
     nothing |= {"entered_veh": samples, "turned_veh": np.zeros(len(net.turns))}
-    return Measurement(time_s=0.0, **{**nothing, "group_queue_veh": np.zeros(len(net.groups)), **readings})
+    return Measurement(
+        time_s=0.0,
+        **{
+            **nothing,
+            "group_queue_veh": np.zeros(len(net.groups)),
+            "group_seen_veh": np.zeros(len(net.groups)),
+            **readings,
+        },
+    )
 
 
 def estimated(net: Network, *seen: Measurement) -> State:
@@ -133,7 +141,7 @@ def estimated(net: Network, *seen: Measurement) -> State:
 def standing(net: Network, by_group: Floats) -> dict[str, Floats]:
     """Readings of so many who stand on the lanes of each group, all in view."""
     by_link = np.bincount(net.group_link, by_group, len(net.links))
-    return {"group_queue_veh": by_group, "queue_veh": by_link, "seen_veh": by_link}
+    return {"group_queue_veh": by_group, "group_seen_veh": by_group, "queue_veh": by_link, "seen_veh": by_link}
 
 
 @given(seed=SEEDS)

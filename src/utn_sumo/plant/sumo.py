@@ -250,6 +250,7 @@ class SumoPlant:
             turned_veh=_total(counted, self._ids.turn),
             queue_veh=_total(area.getLastStepHaltingNumber, self._ids.area),
             group_queue_veh=_total(area.getLastStepHaltingNumber, self._ids.group),
+            group_seen_veh=_total(area.getLastStepVehicleNumber, self._ids.group),
             beside_veh=_total(counted, self._ids.joining) - _total(counted, self._ids.parting),
             seen_veh=_total(area.getLastStepVehicleNumber, self._ids.area),
             entry_occupancy=occupancy(self._ids.entry),
