@@ -86,7 +86,7 @@ class Webster(Peer):
     def programmes(self, network: Network, chosen: Case) -> tuple[Network, list[ET.Element]]:
         wanted = webster.Wanted(**self.model_dump())
         network, green_s = webster.timed(network, chosen, wanted, coordinated=self.coordinated)
-        return network, webster.fixed(network, green_s)
+        return network, webster.fixed(network, green_s, chosen.begin_s)
 
 
 class CoordinatedWebster(Webster):

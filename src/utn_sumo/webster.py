@@ -71,13 +71,13 @@ def timed(network: Network, chosen: Case, wanted: Wanted, *, coordinated: bool) 
         sumo_tools.run_tool(ADAPTATION, [*(f"--{name}={value}" for name, value in words.items()), *flags])
         network, green_s = _greens(network, output)
         if not coordinated:
-            return _with_cycles(network, green_s), green_s
+            return _with_cycles(network, green_s, chosen.begin_s), green_s
         network, green_s = _in_step(network, green_s)
         _write_net(chosen.net_file, network, green_s, net_file)
         sumo_tools.run_tool(COORDINATION, ["-n", str(net_file), "-r", str(routes), "-o", str(output)])
         offsets_s = {logic.attrib["id"]: float(logic.attrib["offset"]) for logic in ET.parse(output).iter("tlLogic")}
     junctions = (
-        replace(junction, offset_s=round(offsets_s.get(junction.id, 0.0)) % junction.cycle_s)
+        replace(junction, offset_s=(round(offsets_s.get(junction.id, 0.0)) - chosen.begin_s) % junction.cycle_s)
         for junction in network.junctions
     )
     return replace(network, junctions=tuple(junctions)), green_s
@@ -121,17 +121,18 @@ def _write_net(source: Path, network: Network, green_s: Floats, target: Path) ->
     place = list(root).index(logics[0]) if logics else len(root)
     for logic in logics:
         root.remove(logic)
-    own = {logic.attrib["id"]: logic for logic in fixed(network, green_s)}
+    own = {logic.attrib["id"]: logic for logic in fixed(network, green_s, 0.0)}
     for logic in (others | own).values():
         root.insert(place, logic)
     ET.ElementTree(root).write(target, encoding="utf-8")
 
 
-def fixed(network: Network, green_s: Floats) -> list[ET.Element]:
-    """Static programmes of the junctions under these greens (S,)."""
+def fixed(network: Network, green_s: Floats, begin_s: float) -> list[ET.Element]:
+    """Static programmes of the junctions under these greens (S,); their offsets count from `begin_s`."""
     logics = []
     for index, junction in enumerate(network.junctions):
-        given = {"id": junction.id, "type": "static", "programID": PROGRAM, "offset": case.in_digits(junction.offset_s)}
+        offset = case.in_digits(begin_s + junction.offset_s)
+        given = {"id": junction.id, "type": "static", "programID": PROGRAM, "offset": offset}
         logic = ET.Element("tlLogic", given)
         for state, seconds in signals.cycle_phases(network, index, green_s):
             ET.SubElement(logic, "phase", duration=case.in_digits(seconds), state=state)
@@ -160,18 +161,19 @@ def _greens(network: Network, output: Path) -> tuple[Network, Floats]:
     return part, green_s
 
 
-def _with_cycles(network: Network, green_s: Floats) -> Network:
-    """The network with the cycles that these greens (S,) make."""
-    lasts_s = green_s + network.clearance_s
+def _with_cycles(network: Network, green_s: Floats, begin_s: float) -> Network:
+    """The network with the cycles that these greens (S,) make, and the net's own offsets on SUMO's clock."""
+    lasts_s = np.bincount(network.stage_junction, green_s + network.clearance_s)
     junctions = (
-        replace(junction, cycle_s=float(lasts_s[list(junction.stages)].sum())) for junction in network.junctions
+        replace(each, cycle_s=cycle_s, offset_s=((each.offset_s + begin_s) % each.cycle_s - begin_s) % cycle_s)
+        for each, cycle_s in zip(network.junctions, lasts_s.tolist(), strict=True)
     )
     return replace(network, junctions=tuple(junctions))
 
 
 def _in_step(network: Network, green_s: Floats) -> tuple[Network, Floats]:
     """The network with one cycle, the longest that these greens (S,) make, and greens in proportion that fill it."""
-    cycle_s = float(_with_cycles(network, green_s).cycle_s.max())
+    cycle_s = float(np.bincount(network.stage_junction, green_s + network.clearance_s).max())
     network = replace(network, junctions=tuple(replace(junction, cycle_s=cycle_s) for junction in network.junctions))
     total_s = np.bincount(network.stage_junction, green_s)
     return network, signals.whole_seconds(network, green_s * (network.green_budget_s / total_s)[network.stage_junction])
