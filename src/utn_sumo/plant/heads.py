@@ -8,10 +8,10 @@ import numpy as np
 
 from utn_sumo import clearances
 from utn_sumo.clearances import Phases, Times
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import Bools, Floats, Ints, Network, Stage, View
 
-LONGEST_RED_S = 120.0
-"""A stage that somebody waits for comes next after so long without green, whatever is wished."""
+MOST_PATIENCE_S = 150.0
+"""A stage that somebody has waited for so long comes next, whatever is wished."""
 
 
 class Heads:
@@ -29,8 +29,22 @@ class Heads:
         """(S,) when each stage last ended."""
         self._ways: dict[tuple[int, int], Phases] = {}
         self._times = [Times.of(network, junction) for junction in network.junctions]
+        self._called_s = np.zeros(len(network.stages))
+        """(S,) since when somebody has been waiting for each stage."""
         self._due: list[list[tuple[float, str]]] = [[] for _ in network.junctions]
         """(time, letters) still to be shown, by junction."""
+        self._served = (network.serves.astype(float) @ _turn_groups(network)) > 0
+        """(S, G) lane groups that a stage lets go."""
+        self._walked = np.array(
+            [
+                any(
+                    stage.state[letter] in clearances.GREEN
+                    for letter in network.junctions[stage.junction].without_yellow
+                )
+                for stage in network.stages
+            ]
+        )
+        """(S,) stages in which pedestrians go, whom no detector sees."""
 
     def start(self, now_s: float) -> None:
         """Show every junction's first stage."""
@@ -62,6 +76,17 @@ class Heads:
         red[self.stage] = 0.0
         return red
 
+    def patient(self, wish: Ints, view: View) -> Ints:
+        """(J,) the wish, but for stages that somebody has waited for too long: these come next, the longest first."""
+        called = self._walked | (self._served @ view.waiting_veh > 0)
+        called[view.stage] = False
+        self._called_s[~called] = view.time_s
+        waited_s = view.time_s - self._called_s
+        kept = wish.copy()
+        for stage in sorted(np.flatnonzero(waited_s >= MOST_PATIENCE_S), key=lambda stage: waited_s[stage]):
+            kept[self.network.stages[stage].junction] = stage
+        return kept
+
     def switch(self, index: int, stage: int, now_s: float) -> None:
         """Lead a junction that is free to another of its stages."""
         first = int(self.stage[index])
@@ -77,3 +102,14 @@ class Heads:
         self.red_since_s[first] = now_s
         self.stage[index], self.begin_s[index] = stage, at_s
         self.advance(now_s)
+
+
+def _turn_groups(network: Network) -> Floats:
+    """(M, G) 1 where a turn queues in a lane group."""
+    return np.equal.outer(network.turn_group, np.arange(len(network.groups))).astype(float)
+
+
+def _is_walked(network: Network, stage: Stage) -> bool:
+    """Whether a stage has green for letters that are no vehicles'."""
+    letters = network.junctions[stage.junction].without_yellow
+    return any(stage.state[letter] in clearances.GREEN for letter in letters)

@@ -242,7 +242,7 @@ class SumoPlant:
             free = heads.free(self.time_s)
             if free.any():
                 view = self._eyes.look(self._sumo, self.time_s, heads, free)
-                wish = execution.wish(view)
+                wish = heads.patient(execution.wish(view), view)
                 for index in np.flatnonzero(free & (wish != heads.stage)):
                     heads.switch(int(index), int(wish[index]), self.time_s)
             self._decision_s += execution.every_s
