@@ -22,7 +22,6 @@ from utn_sumo import (
     metrics,
     monitor,
     native,
-    network,
     recording,
     streets,
     traffic,
@@ -61,7 +60,7 @@ def run(
     if scenario.controller == native.NAME:
         return native.run(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
     chosen = traffic.given(scenario) if scenario.net.endswith(SUFFIX) else None
-    net = network.load(scenario.net) if chosen is None else streets.controllable(chosen)
+    net = streets.named(scenario.net) if chosen is None else streets.controllable(chosen)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.settings)

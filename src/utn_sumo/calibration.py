@@ -1,7 +1,8 @@
 """Link parameters from recorded runs: least squares on the model's prediction error, one and several steps ahead.
 
 Fitted by link: saturation flow, storage, queue spacing, free speed; for the network: the start-up lag; and turning
-fractions from the turn loops. Each comes with its standard error. A calibration is a JSON file beside the
+fractions from the turn loops. Read off the record is what a source lets in at most while vehicles wait outside. Each
+comes with its standard error. A calibration is a JSON file beside the
 net, or named in a scenario; the demand and the plant never see it, only the model does.
 """
 
@@ -23,11 +24,14 @@ from utn_sumo.rollout import Outside, predict, starts
 
 STEP_S = 10.0
 """The paper's sampling interval."""
-ERROR_VEH = 4.0
-"""Size of a one-step error, against which a parameter's distance from its prior weighs."""
+ERROR_SHARE, LEAST_ERROR_VEH = 0.6, 1.0
+"""Size of an error, against which a parameter's distance from its prior weighs: as a share of what x itself changes by
+on that link, so that a link where little happens counts like any other, but no less than a vehicle."""
 FITTED = {"saturation_flow_veh_s": 0.2, "storage_veh": 0.1, "queue_spacing_m": 0.1, "free_speed_m_s": 0.2}
 """Parameters of a link, and their relative standard deviation about what the network's links have in common: a link
 that never saturates or fills is taken to be like the others. The road's length settles most of the storage."""
+WAITING_VEH, WAITING_STEPS = 3.0, 8
+"""Vehicles that wait outside all through a step whose entry is taken to be used in full, and how many such steps."""
 COMMON_SHARE = 0.3
 """Standard deviation of what the links have in common about what the net says, relative."""
 LAG_PRIOR_S = 2.0
@@ -46,11 +50,15 @@ def calibrate(network: Network, log: Log, step_s: float = STEP_S) -> dict[str, A
     from scipy.optimize import least_squares  # noqa: PLC0415 - heavy
 
     fractions, fraction_sd = _fractions(network, log)
-    with_turns = _with_fractions(network, fractions)
+    entry, entry_sd = _entry_flow_veh_s(network, log)
+    with_turns = _with_entries(_with_fractions(network, fractions), entry)
     size = len(FITTED) * len(network.links)
     start = np.append(np.ones(size), network.startup_lag_s)
     spread = np.array(list(FITTED.values()))[:, None]
     outside, first = Outside.known(network, log), starts(log, HORIZON)
+
+    changed = np.array([log.x_veh[first] - log.true_x_veh[first + ahead] for ahead in FITTED_AHEAD])
+    usual_veh = np.maximum(ERROR_SHARE * np.sqrt(np.mean(changed**2, axis=(1, 2), keepdims=True)), LEAST_ERROR_VEH)
 
     def residual(parameters: Floats) -> Floats:
         model = LinkModel(_scaled(with_turns, parameters), step_s)
@@ -61,7 +69,7 @@ def calibrate(network: Network, log: Log, step_s: float = STEP_S) -> dict[str, A
         common = factors.mean(axis=1, keepdims=True)
         alone, together = (factors - common) / spread, (common - 1) / COMMON_SHARE
         lag = (parameters[-1:] - start[-1]) / LAG_PRIOR_S
-        return np.concatenate([error.ravel() / ERROR_VEH, alone.ravel(), together.ravel(), lag])
+        return np.concatenate([(error / usual_veh).ravel(), alone.ravel(), together.ravel(), lag])
 
     fit = least_squares(
         residual,
@@ -71,10 +79,12 @@ def calibrate(network: Network, log: Log, step_s: float = STEP_S) -> dict[str, A
         x_scale=np.append(np.full(size, 0.1), 1.0),
         max_nfev=EVALUATIONS,
     )
-    error = fit.fun[: len(first) * log.x_veh[0].size].reshape(-1, *log.x_veh.shape[1:]) * ERROR_VEH
+    error = fit.fun[: len(first) * log.x_veh[0].size].reshape(-1, *log.x_veh.shape[1:]) * usual_veh[0]
     scale = 2 * fit.cost / max(len(fit.fun) - len(fit.x), 1)
     sd = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * scale)
     content = _content(_scaled(with_turns, fit.x), fit.x, sd, fraction_sd)
+    for index in np.flatnonzero(np.isfinite(entry)):
+        content["links"][network.links[index].id]["entry_flow_veh_s"] = [entry[index], entry_sd[index]]
     return {"one_step_rmse_veh": np.sqrt(np.mean(error**2, axis=(0, 2))).tolist(), **content}
 
 
@@ -101,6 +111,29 @@ def _fractions(network: Network, log: Log) -> tuple[Floats, Floats]:
     total = np.bincount(network.turn_link, turned)[network.turn_link]
     share = turned / total
     return share, np.sqrt(share * (1 - share) / total)
+
+
+def _entry_flow_veh_s(network: Network, log: Log) -> tuple[Floats, Floats]:
+    """(Z,) what enters at most while somebody waits outside all the time, and its standard error; infinite where
+    nobody waits so often enough.
+    """
+    waiting = Outside.known(network, log).source_queue_veh
+    all_through = (np.minimum(waiting, log.true_waiting_veh) > WAITING_VEH) & network.is_source
+    entry, sd = np.full(len(network.links), np.inf), np.full(len(network.links), np.nan)
+    for index in range(len(network.links)):
+        rate = log.entered_veh[..., index][all_through[..., index]] / network.control_step_s
+        if len(rate) >= WAITING_STEPS:
+            # A queue that reaches the entry lets in less: the freest steps tell what else there is.
+            freest = np.sort(rate)[len(rate) * 3 // 4 :]
+            entry[index], sd[index] = freest.mean(), freest.std() / np.sqrt(len(freest))
+    return entry, sd
+
+
+def _with_entries(network: Network, entry_flow_veh_s: Floats) -> Network:
+    links = (
+        replace(link, entry_flow_veh_s=float(flow)) for link, flow in zip(network.links, entry_flow_veh_s, strict=True)
+    )
+    return replace(network, links=tuple(links))
 
 
 def _content(network: Network, parameters: Floats, sd: Floats, fraction_sd: Floats) -> dict[str, Any]:
@@ -154,7 +187,8 @@ def applied(network: Network, path: Path) -> Network:
 
 
 def _values(link: Mapping[str, Any]) -> dict[str, Any]:
-    values = {name: float(link[name][0]) for name in FITTED}
+    optional = ("entry_flow_veh_s",) if "entry_flow_veh_s" in link else ()
+    values = {name: float(link[name][0]) for name in (*FITTED, *optional)}
     for name, value in values.items():
         if not 0 < value < np.inf:
             raise ValueError(f"{name} is {value:g}")

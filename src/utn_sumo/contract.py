@@ -52,6 +52,8 @@ class Link:
     """SUMO lanes, inside nodes without signals, over which traffic comes onto the link amid it."""
     parting: tuple[str, ...] = ()
     """Those over which it leaves amid it."""
+    entry_flow_veh_s: float = np.inf
+    """Most that comes from outside however much room there is: where its vehicles are inserted is not the road's."""
 
 
 @dataclass(frozen=True)
@@ -258,6 +260,11 @@ class Network:
         return np.array([link.lanes for link in self.links], dtype=np.int64)
 
     @cached_property
+    def entry_flow_veh_s(self) -> Floats:
+        """(Z,) most that enters each link from outside."""
+        return np.array([link.entry_flow_veh_s for link in self.links])
+
+    @cached_property
     def is_source(self) -> Bools:
         """(Z,) whether traffic from outside enters the link."""
         return np.array([link.is_source for link in self.links], dtype=np.bool_)
@@ -282,15 +289,20 @@ class Network:
         """(S,) clearance after each stage."""
         return np.array([stage.clearance_s for stage in self.stages])
 
-    @cached_property
-    def cycle_starts_s(self) -> Floats:
-        """(R, S) starts of the cycles of each stage's junction in a control step, the one under way at 0 first."""
+    def cycle_starts_s(self, time_s: Floats | float = 0.0) -> Floats:
+        """(..., R, S) starts of the cycles of each stage's junction, counted from the times `time_s` (...).
+
+        As many as may show in a control step that begins then, the one under way first. Under way is what still moves:
+        it starts and ends `startup_lag_s` after its signals.
+        """
         cycle_s, offset_s = (
             np.array([getattr(junction, name) for junction in self.junctions])[self.stage_junction]
             for name in ("cycle_s", "offset_s")
         )
         repeats = np.arange(-1, int(np.ceil(self.control_step_s / cycle_s.min())))
-        return np.asarray(offset_s % cycle_s + repeats[:, None] * cycle_s)
+        first_s = (offset_s - np.asarray(time_s)[..., None]) % cycle_s
+        first_s = np.where(first_s + self.startup_lag_s > cycle_s, first_s - cycle_s, first_s)
+        return np.asarray(first_s[..., None, :] + repeats[:, None] * cycle_s)
 
     def since_cycle_start_s(self, green_s: Floats) -> Floats:
         """(..., S) from the start of its junction's cycle to each stage's green, under the plan `green_s` (..., S)."""
@@ -444,6 +456,8 @@ class Measurement:
     """(Z,) standing in the lane-area detectors at the end."""
     group_queue_veh: Floats
     """(G,) of these, who stands on the lanes of each lane group."""
+    group_seen_veh: Floats
+    """(G,) in the lane-area detectors on the lanes of each lane group at the end, moving or not."""
     beside_veh: Floats
     """(Z,) counted onto the link amid it over the loops at side roads, less those counted off it."""
     seen_veh: Floats

@@ -83,6 +83,17 @@ def _named(kind: str, lane: str) -> str:
     return f"utn_{kind}_{lane}"
 
 
+def watched_lane_m(network: Network) -> tuple[Floats, Floats]:
+    """Lane metres that the lane-area detectors see: (G,) by lane group, (Z,) of each link before its lanes part."""
+    seen_m = [dict(_watched(network, link)) for link in network.links]
+    groups = [len(group.lanes) * seen_m[group.link][network.links[group.link].edges[-1]] for group in network.groups]
+    before = [
+        sum(metres * len(network.edge_lanes[edge]) for edge, metres in seen.items() if edge != link.edges[-1])
+        for seen, link in zip(seen_m, network.links, strict=True)
+    ]
+    return np.array(groups), np.array(before, dtype=float)
+
+
 def _watched(network: Network, link: Link) -> list[tuple[str, float]]:
     """(edge, metres of it seen) from the stop line upstream, as far as the lane-area detectors reach."""
     watched, rest = [], AREA_REACH_M

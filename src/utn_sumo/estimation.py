@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from utn_sumo.contract import Floats, Measurement, Network, State
-from utn_sumo.detectors import AREA_REACH_M
+from utn_sumo.detectors import AREA_REACH_M, watched_lane_m
 from utn_sumo.model import share_on_the_way
 
 FULL_SHARE = 0.8
@@ -77,6 +77,13 @@ class Estimator:
         length_m = np.array([link.length_m for link in network.links])
         speed_m_s = np.array([link.free_speed_m_s for link in known.links])
         self._watched_veh = network.storage_veh * np.minimum(1, AREA_REACH_M / length_m)
+        group_m, before_m = watched_lane_m(network)
+        lane_m = before_m + np.bincount(network.group_link, group_m, links)
+        self._group_veh = np.maximum(self._watched_veh[network.group_link] * group_m / lane_m[network.group_link], 1.0)
+        """(G,) vehicles that the part of each lane group in view holds."""
+        self._before_veh = self._watched_veh * before_m / lane_m
+        """(Z,) vehicles that the part in view before the lanes part holds."""
+        self._crowded_before = np.zeros(links)
         hidden_s = np.maximum(length_m - AREA_REACH_M, 0) / speed_m_s
         self._hidden = share_on_the_way(hidden_s, network.sample_s, known.delay_samples)
         """(H, Z) share of each past sample's inflow that has not come into view, on a free road."""
@@ -118,9 +125,14 @@ class Estimator:
         covariance[:, 2, 2] += self._disturbance_step_variance
 
         hidden = (self._hidden * self._past_inflow_veh).sum(axis=0)
-        crowd = (seen.seen_veh / self._watched_veh - QUIET_SHARE) / (CROWDED_SHARE - QUIET_SHARE)
+        # Who stood beyond the view when the last step ended may not have come into it yet.
+        crowded = self._crowded(seen)
+        crowd = (np.maximum(crowded, self._crowded_before) - QUIET_SHARE) / (CROWDED_SHARE - QUIET_SHARE)
+        self._crowded_before = crowded
         quiet = crowd < 1
         variance = SEEN_SD_VEH**2 + (SEEN_SD_SHARE * hidden) ** 2 + (CROWDED_SD_VEH * np.maximum(crowd, 0.0)) ** 2
+        # Where side roads meet a link before what is watched of it, who came there may not be in view yet.
+        variance = variance + np.where(self._watched_veh < self.network.storage_veh, seen.beside_veh, 0.0) ** 2
         gain = quiet[:, None] * covariance[:, :, 0] / (covariance[:, 0, 0] + variance)[:, None]
         residual = seen.seen_veh + hidden - x
         self._covariance = covariance - gain[:, :, None] * covariance[:, None, 0, :]
@@ -133,6 +145,14 @@ class Estimator:
         self._disturbance_veh = seen.beside_veh.copy()
         if self._disturbance_variance > 0:
             self._disturbance_veh += self._x_veh - before - entered_veh + (1 - self._bias) * left
+
+    def _crowded(self, seen: Measurement) -> Floats:
+        """(Z,) share of the room in view that is taken, where it is most: one lane may be full beside an empty one."""
+        link, links = self.network.group_link, len(self.network.links)
+        before = seen.seen_veh - np.bincount(link, seen.group_seen_veh, links)
+        shares = np.divide(before, self._before_veh, out=np.zeros(links), where=self._before_veh > 0)
+        np.maximum.at(shares, link, seen.group_seen_veh / self._group_veh)
+        return shares
 
     def _queue(self, seen: Measurement) -> None:
         """q: standing in view, and all beyond the view where the view stands full.

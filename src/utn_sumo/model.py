@@ -245,6 +245,9 @@ class LinkModel:
         """(M, M) 1 where two turns are of one lane group."""
         self._is_exit = (~fed).astype(float)
         self._is_source = network.is_source.astype(float)
+        entry_veh = np.minimum(network.entry_flow_veh_s * step_s, INFINITE_ROOM_VEH)
+        self._entry_veh = entry_veh if (entry_veh < INFINITE_ROOM_VEH).any() else None
+        """(Z,) most that enters from outside in a step; None where nothing limits it."""
         # Room that opens at the stop line reaches the entry as a wave: within one step, only so much of it does.
         self._wave_s = np.array([link.length_m for link in network.links]) / WAVE_SPEED_M_S
         self.numbers = numbers or LinkNumbers(
@@ -409,6 +412,7 @@ class LinkModel:
         feeding = ops.matmul(self.feeds, open_fraction)
         claim = open_fraction / ops.maximum(self._at_next(feeding) + self._is_exit, 1e-9)
 
+        wanting = (state.source_queue_veh + demand_veh) * self._is_source
         queue = self.by_link(state.q_veh)
         moving = state.x_veh - queue
         delay = self.delay_s(queue)
@@ -421,7 +425,7 @@ class LinkModel:
         return StepTerms(
             q_veh=state.q_veh,
             fraction=fraction,
-            wanting_veh=(state.source_queue_veh + demand_veh) * self._is_source,
+            wanting_veh=wanting if self._entry_veh is None else ops.minimum(wanting, self._entry_veh),
             arrivals=self._arrivals(moving, state.past_inflow_veh, self.on_the_way(delay)),
             in_green=in_green,
             saturated_veh=self.saturated_veh(turn_green_s, fraction),
@@ -491,12 +495,13 @@ def check_step(network: Network, step_s: float) -> None:
         raise SettingError(f"setting 'step_s' is {step_s:g}: it must divide {whole}")
 
 
-def green_windows(network: Network, green_s: Floats, step_s: float) -> GreenWindows:
-    """The windows of a plan `green_s` (..., S) [s].
+def green_windows(network: Network, green_s: Floats, step_s: float, time_s: Floats | None = None) -> GreenWindows:
+    """The windows of a plan `green_s` (..., S) [s] in a control step that begins at the times `time_s` (...).
 
     A junction's cycle starts at its offset and repeats within the control step; before its first start the previous
     repetition of the same plan is still running. Discharge starts `startup_lag_s` after the green and runs as long
-    into the yellow.
+    into the yellow. Without a time the control step is any: the first, and of cycles that do not divide it, which begin
+    elsewhere in every one, what they show on average.
     """
     steps = round(network.control_step_s / step_s)
     stages, held = len(network.stages), network.held_greens
@@ -507,14 +512,14 @@ def green_windows(network: Network, green_s: Floats, step_s: float) -> GreenWind
     since = np.concatenate([since, after], axis=-1) + network.startup_lag_s
     lasts = np.concatenate([green_s, np.broadcast_to([each.duration_s for each in held], after.shape)], axis=-1)
     # All at once: (..., repetitions, windows), then (..., steps, repetitions, windows).
-    start = network.cycle_starts_s[:, stage] + since[..., None, :]
+    starts_s = network.cycle_starts_s(0.0 if time_s is None else time_s)
+    start = starts_s[..., stage] + since[..., None, :]
     begin = np.arange(steps)[:, None, None] * step_s
     closes = np.minimum((start + lasts[..., None, :])[..., None, :, :], begin + step_s) - begin
     overlap = np.maximum(closes - np.maximum(start[..., None, :, :] - begin, 0.0), 0.0)
-    # Cycles that do not divide the control step begin elsewhere in every one: what they show on average counts.
     cycle_s = network.cycle_s[network.stage_junction][stage]
     odd = network.control_step_s % cycle_s > 0
-    if odd.any():
+    if odd.any() and time_s is None:
         usual = lasts * network.control_step_s / cycle_s
         shown = overlap.sum(axis=(-3, -2))
         scale = np.where(odd, usual / np.maximum(shown, 1e-9), 1.0)

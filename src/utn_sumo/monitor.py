@@ -50,7 +50,7 @@ def watch(network: Network, switches: Path, duration_s: float, begin_s: float = 
     verdict = Verdict()
     for junction in network.junctions:
         switched = [(second - int(begin_s), state) for second, state in shown.get(junction.id, [])]
-        _Guard(network, junction, verdict, begin_s).judge(_stretches(switched, int(duration_s)))
+        _Guard(network, junction, verdict).judge(_stretches(switched, int(duration_s)))
     return verdict
 
 
@@ -130,11 +130,11 @@ class _Rules:
 class _Guard:
     """Follows the signals of one junction through the seconds of a run."""
 
-    def __init__(self, network: Network, junction: Junction, verdict: Verdict, begin_s: float) -> None:
+    def __init__(self, network: Network, junction: Junction, verdict: Verdict) -> None:
         self.junction = junction
         self.verdict = verdict
         self.rules = _Rules.of(network, junction)
-        self.under_way = (junction.offset_s - begin_s) % junction.cycle_s > 0
+        self.under_way = junction.offset_s % junction.cycle_s > 0
         """Whether a cycle is under way when the run begins: how long its green has lasted nobody saw."""
         last = network.stages[junction.stages[-1]]
         self.ends = last.clearance[-1][0] if last.clearance else last.state

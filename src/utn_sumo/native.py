@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from utn_sumo import metrics, monitor, network, recording, streets, traffic
+from utn_sumo import metrics, monitor, recording, streets, traffic
 from utn_sumo.case import SUFFIX, Case
 from utn_sumo.errors import UtnError
 from utn_sumo.plant import untouched
@@ -85,7 +85,7 @@ def of(scenario: Scenario) -> Case:
     """The scenario's net and traffic: of a .sumocfg its own, else a net with demand drawn as for every controller."""
     if scenario.net.endswith(SUFFIX):
         return traffic.given(scenario)
-    net = network.load(scenario.net)
+    net = streets.named(scenario.net)
     options = (("time-to-teleport", "-1"), ("max-depart-delay", "-1"))
     return Case(
         net.net_file, net.net_file, (traffic.drawn(scenario, net),), (), 0.0, scenario.duration_s, -1.0, options

@@ -89,7 +89,9 @@ def predict(model: LinkModel, log: Log, horizon: int, *, outside: Outside, fract
     """
     at = starts(log, horizon)
     state = observe(model, log, at, outside.source_queue_veh)
-    windows = green_windows(model.network, log.green_s, model.step_s)
+    network = model.network
+    time_s: Floats = network.control_step_s * np.arange(len(log.green_s), dtype=float)[:, None]
+    windows = green_windows(network, log.green_s, model.step_s, time_s)
     steps = windows.shown_s.shape[-2]
     x, queue, inflow = [], [], []
     for ahead in range(horizon):

@@ -59,7 +59,7 @@ def study_mismatch(
             raise SettingError(f"setting {name!r} is {value!r}: it must be 'known' or 'forecast'")
     whole = streets.named(base["net"])
     model = calibration.for_model(whole, base.get("calibration"))
-    step_s = step_s or whole.sample_s
+    step_s = whole.sample_s if step_s is None else step_s
     check_step(whole, step_s)
     results = []
     for demand in demands:
@@ -136,7 +136,7 @@ def study_calibration(
     Net, demands and step are as in `study_mismatch`.
     """
     whole = streets.named(base["net"])
-    step_s = step_s or whole.sample_s
+    step_s = whole.sample_s if step_s is None else step_s
     check_step(whole, step_s)
     items = [scenario(**base, demand=demand, seed=seed) for demand in demands for seed in seeds]
     log = Log.stack([recording.read_log(path) for path in record(items, folder, tick)])

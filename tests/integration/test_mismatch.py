@@ -73,6 +73,7 @@ def test_mismatch_and_calibrate_work_from_the_command_line(tmp_path: Path) -> No
     ("options", "complaint"),
     [
         (["--step", "7"], "'step_s' is 7"),
+        (["--step", "0"], "'step_s' is 0"),
         (["--inputs", "guessed"], "'inputs' is 'guessed'"),
         (["--turning", "guessed"], "'turning' is 'guessed'"),
         (["--horizon", "0"], "'horizon' is '0'"),

@@ -50,6 +50,8 @@ def counted(net: Network, *, entered: Floats | None = None, **readings: Floats) 
     samples = entered if entered.ndim == 2 else over_step(net, entered)
     rest = dict.fromkeys(("queue_veh", "seen_veh", "beside_veh", "stop_line_occupancy"), links)
     rest["group_queue_veh"] = np.zeros(len(net.groups))
+    # One lane group a link.
+    rest["group_seen_veh"] = np.asarray(readings.get("seen_veh", links))[net.group_link]
     covered = occupancy(net, samples.sum(axis=0), FREE_COVER_S)
     every = {**rest, "entered_veh": samples, "entry_occupancy": covered, "turned_veh": np.zeros(len(net.turns))}
     return Measurement(time_s=120.0, **{**every, **readings})

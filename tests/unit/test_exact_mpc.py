@@ -150,9 +150,14 @@ def test_smooth_windows_are_the_green_windows(utn17: Network, step_s: float) -> 
             for j in shifted.junctions
         ),
     )
+    # Cycles that do not divide the control step, as that is of the longest.
+    cycles_s = (120.0, 90.0, 70.0, 110.0, 120.0, 90.0, 100.0, 80.0)
+    odd = replace(
+        held, junctions=tuple(replace(j, cycle_s=own) for j, own in zip(held.junctions, cycles_s, strict=True))
+    )
     # No green begins in the last second of a step: the rounded end of that one is in between.
     rng = np.random.default_rng(1)
-    for net in (utn17, shifted, held):
+    for net in (utn17, shifted, held, odd):
         model, green = LinkModel(net, step_s, SmoothOperations(1e-4, 1e-4)), ca.SX.sym("green", len(net.stages))
         steps = range(round(net.control_step_s / step_s))
         symbols = ca.Function(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import utn_network
-from utn_sumo import network
+from utn_sumo import network, signals
 from utn_sumo.contract import EXIT, Network
 from utn_sumo.errors import NetworkError
 
@@ -280,6 +280,25 @@ def test_a_signal_that_can_not_be_controlled_is_named_and_left_alone(town: Path,
     # Its approaches are no links; what they fed is now fed from outside.
     assert not {"8", "9"} & {link.id for link in found.links}
     assert next(link for link in found.links if link.edges[-1] == "11").is_source
+
+
+def test_of_two_signals_that_stop_one_road_the_one_that_stops_less_is_left_alone(town: Path, utn17: Network) -> None:
+    text, content = programme(utn17, "J4"), town.read_text(encoding="utf-8")
+    turn = next(line for line in content.splitlines() if 'tl="J4" linkIndex="0"' in line)
+    phases = "".join(f'<phase duration="{d}" state="{s}"/>' for d, s in ((57, "Gr"), (3, "yr"), (57, "rG"), (3, "ry")))
+    arrow = f'<tlLogic id="arrow" type="static" programID="0" offset="0">{phases}</tlLogic>\n'
+    moved = turn.replace('tl="J4" linkIndex="0"', 'tl="arrow" linkIndex="0"')
+    found = network.load(str(edited(town, (text, arrow + text), (turn, moved))))
+    assert set(found.left_alone) == {"arrow"}
+    assert "'J4'" in found.left_alone["arrow"]
+    assert [junction.id for junction in found.junctions] == [junction.id for junction in utn17.junctions]
+    assert signals.refused(found) == {}
+
+
+def test_a_signal_whose_programme_has_no_phases_is_left_alone(town: Path, utn17: Network) -> None:
+    text = programme(utn17, "J4")
+    found = network.load(str(edited(town, (text, text.splitlines()[0] + "\n"))))
+    assert "no signal programme" in found.left_alone["J4"]
 
 
 def test_a_net_with_no_signal_to_control_is_refused_with_the_reasons(town: Path, utn17: Network) -> None:

@@ -217,12 +217,20 @@ def smooth_windows(model: LinkModel, green_s: Any, begin_s: float) -> tuple[Any,
     lasts = ops.matmul(sp.csr_array(own * ~follows[:, None]), green_s) + lasts_s
     shown: Any = 0
     last: Any = 0
-    for cycle_start_s in net.cycle_starts_s[:, stage]:
+    whole: Any = 0
+    for cycle_start_s in net.cycle_starts_s()[:, stage]:
         opens = since + cycle_start_s
         closes = ops.minimum(opens + lasts, model.step_s)
         overlap = ops.maximum(closes - ops.maximum(opens, 0.0), 0.0)
         shown = shown + overlap
         last = ops.maximum(last, closes * ops.share(overlap))
+        ends = ops.minimum(opens + lasts, net.control_step_s - begin_s)
+        whole = whole + ops.maximum(ends - ops.maximum(opens, -begin_s), 0.0)
+    # Cycles that do not divide the control step show in it what they do on average.
+    cycle_s = net.cycle_s[net.stage_junction][stage]
+    odd = (net.control_step_s % cycle_s > 0).astype(float)
+    if odd.any():
+        shown = shown * (1.0 - odd + odd * (lasts * (net.control_step_s / cycle_s)) / (whole + (1.0 - odd)))
     window, starts, turns = net.turn_windows
     counts = np.diff([*starts, len(window)])
     free = net.unsignalled.astype(float) * model.step_s

@@ -9,7 +9,7 @@ seconds is never a stage: nobody could use it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -128,7 +128,7 @@ def _is_remnant(phase: Phase, before: Phase) -> bool:
 def own(tls: Any) -> Programme | None:
     """The net's own programme of a signal (a sumolib TLS), if it has one."""
     program = next(iter(tls.getPrograms().values()), None)
-    if program is None:
+    if program is None or not program.getPhases():
         return None
     phases = (
         Phase(phase.state, float(phase.duration), float(phase.minDur) if phase.minDur >= 0 else None, bool(phase.next))
@@ -170,16 +170,23 @@ def switched_elsewhere(files: Sequence[Path]) -> dict[str, str]:
     return found
 
 
-def _elements(file: Path, tag: str) -> list[Any]:
+def _elements(file: Path, tag: str) -> Iterator[Any]:
+    """Of an additional file, those of files that it includes where these stand."""
     from defusedxml import ElementTree  # noqa: PLC0415
 
     with opened(file) as content:
-        return list(ElementTree.parse(content).iter(tag))
+        every = ElementTree.parse(content)
+    for element in every.iter():
+        if element.tag == "include":
+            yield from _elements(file.parent / element.get("href", ""), tag)
+        elif element.tag == tag:
+            yield element
 
 
 def _phase(element: Any) -> Phase:
-    least = element.get("minDur")
-    return Phase(element.get("state", ""), float(element.get("duration", "")), None if least is None else float(least))
+    least, elsewhere = element.get("minDur"), bool((element.get("next") or "").strip())
+    duration_s = float(element.get("duration", ""))
+    return Phase(element.get("state", ""), duration_s, None if least is None else float(least), elsewhere)
 
 
 def why_left_alone(programme: Programme | None, signals: int) -> str:

@@ -93,6 +93,7 @@ def read(
         for signal in signals
     }
     left_alone = {signal: reason for signal, reason in reasons_of.items() if reason}
+    left_alone |= _sharing_approaches([signal for signal in signals if signal.id not in left_alone])
     controlled = [signal for signal in signals if signal.id not in left_alone]
     if not controlled:
         reasons = "; ".join(f"{signal}: {reason}" for signal, reason in left_alone.items())
@@ -105,6 +106,20 @@ def _why_left_alone(signal: Signal) -> str:
     if not signal.approaches:
         return "no motor traffic passes it"
     return programmes.why_left_alone(signal.programme, signal.used_letters)
+
+
+def _sharing_approaches(signals: Sequence[Signal]) -> dict[str, str]:
+    """Signals that stop traffic of a road of which another stops more, and why they are left alone: a link has one."""
+    found: dict[str, str] = {}
+    taken: dict[str, str] = {}
+    for signal in sorted(signals, key=lambda signal: -len(signal.connections)):
+        approaches = signal.approaches
+        shared = [edge for edge in approaches if edge in taken]
+        if shared:
+            found[signal.id] = f"it shares the road {shared[0]!r} with signal {taken[shared[0]]!r}, which is controlled"
+        else:
+            taken |= dict.fromkeys(approaches, signal.id)
+    return found
 
 
 def shapes(path: Path) -> dict[str, list[tuple[float, float]]]:

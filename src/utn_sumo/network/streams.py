@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ class Signal:
         self.used_letters = 1 + max(used, default=-1)
         self.letters = self.used_letters if programme is None else len(programme.phases[0].state)
 
-    @property
+    @cached_property
     def approaches(self) -> list[str]:
         """Edges with motor traffic that it stops."""
         return sorted({each.getFrom().getID() for each in for_motors(connection for connection, _ in self.connections)})

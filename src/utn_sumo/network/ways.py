@@ -64,7 +64,8 @@ def turned_veh(net: Any, trips_veh: Mapping[tuple[str, ...], float]) -> dict[tup
     for first in range(0, len(legs), AT_ONCE):
         origins = sorted(legs)[first : first + AT_ONCE]
         _, before = dijkstra(times, indices=origins, return_predecessors=True)
-        for origin, tree in zip(origins, before.tolist(), strict=True):
+        for origin, row in zip(origins, before, strict=True):
+            tree = row.tolist()
             for end, veh in legs[origin].items():
                 at = end
                 while at != origin and tree[at] >= 0:

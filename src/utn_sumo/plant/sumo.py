@@ -85,7 +85,7 @@ class SumoPlant:
         self._ids = detectors.ids(network)
         self._entered: list[tuple[float, Floats]] = []
         """(time, what the entry loops have counted since the control step began) at each reading."""
-        self._boundary_s = [(junction.offset_s - self.begin_s) % junction.cycle_s for junction in network.junctions]
+        self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
         self._execution = execution
         self._heads = Heads(network, self._show)
         self._eyes = Eyes(network, self._ids)
@@ -305,6 +305,7 @@ class SumoPlant:
             turned_veh=_total(counted, self._ids.turn),
             queue_veh=_total(area.getLastStepHaltingNumber, self._ids.area),
             group_queue_veh=_total(area.getLastStepHaltingNumber, self._ids.group),
+            group_seen_veh=_total(area.getLastStepVehicleNumber, self._ids.group),
             beside_veh=_total(counted, self._ids.joining) - _total(counted, self._ids.parting),
             seen_veh=_total(area.getLastStepVehicleNumber, self._ids.area),
             entry_occupancy=occupancy(self._ids.entry),
