@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.fixed_time import FixedTime
-from utn_controllers.mpc.place import remaining_steps
 from utn_sumo.contract import EXIT, Floats, Ints, Network, Plan, State, View
 
 
@@ -132,14 +131,14 @@ class _Pressure(Acyclic):
 
 
 class PricedSettings(WaveSettings):
-    """Settings of `priced`, found on `utn17` with seeds 1 to 10 (`tools/bench.py`)."""
+    """Settings of `priced`, found on `utn17` at demands 0.6, 1.0 and 1.3 with seed 1."""
 
-    horizon_s: float = Field(20.0, gt=0)
+    horizon_s: float = Field(15.0, gt=0)
     """How far ahead a stage is judged [s]; another than the present one loses its clearance of it."""
-    crowding: float = Field(2.0, ge=0)
-    """By how many control steps a full link is dearer than an empty one."""
-    full: float = Field(0.9, gt=0)
-    """Share of its storage from which a link is fed no more."""
+    crowding: float = Field(0.5, ge=0)
+    """By how much a full link is dearer than an empty one, in vehicles."""
+    full: float = Field(0.6, gt=0)
+    """Share of its storage from which a link is fed no more: beyond it some lane is full and stops the junction."""
 
 
 class Priced(FixedTime):
@@ -153,29 +152,26 @@ class Priced(FixedTime):
 
 
 class _Priced(Acyclic):
-    """A vehicle on a link costs the steps that it still has to go, and more the fuller the link is.
+    """A link costs the more the fuller it is, and what a stage moves gains the difference, as pressure does.
 
-    What a stage moves from link to link gains the difference, as pressure does; from a full link into an empty one it
-    gains most, into a full one nothing. A stage is judged by whom it can let through within the horizon, so that
-    among queues that all fill it the present stage goes on, which has no clearance to wait for.
+    Into a full link nothing is gained. A stage is judged by whom it can let through within the horizon, so that among
+    queues that all fill it the present stage goes on, which has no clearance to wait for; where few are about, the
+    stage with most of them comes next.
     """
 
     def __init__(self, network: Network, settings: PricedSettings):
         super().__init__(network, settings.every_s)
         self.settings = settings
-        self._remaining = remaining_steps(network)
         self._fed = network.turn_next != EXIT
         self._next = np.maximum(network.turn_next, 0)
         self._stage, self._turn = np.nonzero(network.serves)
 
     def worth(self, view: View) -> Floats:
         net, settings = self.network, self.settings
-        share = view.x_veh / net.storage_veh
-        price = self._remaining + settings.crowding * share
-        link = net.turn_link
-        ahead = np.where(self._fed, price[self._next], 0.0)
-        gain = np.maximum(price[link] - ahead, 0.0) / np.maximum(self._remaining[link], 1e-9)
-        gain[self._fed & (share[self._next] > settings.full)] = 0.0
+        taken = view.x_veh / net.storage_veh
+        ahead = np.where(self._fed, taken[self._next], 0.0)
+        gain = np.maximum(1 + settings.crowding * (taken[net.turn_link] - ahead), 0.0)
+        gain[self._fed & (taken[self._next] > settings.full)] = 0.0
         lost_s = net.clearance_s[view.stage][net.stage_junction]
         lost_s[view.stage] = 0.0
         open_s = np.maximum(settings.horizon_s - lost_s, 1.0)
