@@ -540,6 +540,45 @@ class Plan:
     """What the controller wants recorded: iterations, residuals, cost."""
 
 
+@dataclass(frozen=True)
+class View:
+    """What is to be seen at one moment, for decisions within the cycle."""
+
+    time_s: float
+    stage: Ints
+    """(J,) stage that each junction shows, or is on its way to."""
+    free: Bools
+    """(J,) junctions whose stage has had its least green."""
+    green_s: Floats
+    """(J,) how long each junction's stage has been green."""
+    red_s: Floats
+    """(S,) how long each stage has been without green."""
+    waiting_veh: Floats
+    """(G,) standing in the lane-area detectors, by lane group."""
+    near_veh: Floats
+    """(G,) in the lane-area detectors, moving or not, by lane group."""
+    x_veh: Floats
+    """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
+    gap_s: Floats
+    """(G,) time since a vehicle was last over a stop-line loop, the shortest of a lane group's lanes."""
+
+
+@runtime_checkable
+class Execution(Protocol):
+    """Whatever carries a plan out within the cycle, by what is to be seen at the moment."""
+
+    every_s: float
+    """Time between two decisions."""
+
+    def begin(self, plan: Plan, state: State) -> None:
+        """Take up the plan of a new control step, and the state that it was made from."""
+        ...
+
+    def wish(self, view: View) -> Ints:
+        """(J,) stage that each junction is to show from now on. Its least green and the clearance are kept anyway."""
+        ...
+
+
 @runtime_checkable
 class Controller(Protocol):
     """Whatever chooses greens once a control step.

@@ -40,6 +40,10 @@ class DetectorIds:
     area: tuple[tuple[str, ...], ...]
     group: tuple[tuple[str, ...], ...]
     """(G,) of the lane-area detectors those on a lane group."""
+    group_stop: tuple[tuple[str, ...], ...]
+    """(G,) of the stop-line loops those on a lane group."""
+    upstream: tuple[tuple[str, ...], ...]
+    """(Z,) of the lane-area detectors those before the lane groups part."""
     joining: tuple[tuple[str, ...], ...]
     parting: tuple[tuple[str, ...], ...]
 
@@ -60,6 +64,14 @@ def ids(network: Network) -> DetectorIds:
         group=tuple(
             tuple(_named("area", f"{network.links[group.link].edges[-1]}_{lane}") for lane in group.lanes)
             for group in network.groups
+        ),
+        group_stop=tuple(
+            tuple(_named("stop", f"{network.links[group.link].edges[-1]}_{lane}") for lane in group.lanes)
+            for group in network.groups
+        ),
+        upstream=tuple(
+            tuple(name for edge, _ in _watched(network, link) if edge != link.edges[-1] for name in on("area", edge))
+            for link in network.links
         ),
         joining=tuple(tuple(_named("side", lane) for lane in link.joining) for link in network.links),
         parting=tuple(tuple(_named("side", lane) for lane in link.parting) for link in network.links),

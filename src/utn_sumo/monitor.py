@@ -113,6 +113,15 @@ class _Rules:
                 lit[signal] = (lit[signal] if was in GREEN else 0.0) + seconds if now in GREEN else 0.0
                 amber[signal] = (amber[signal] if was in YELLOW else 0.0) + seconds if now in YELLOW else 0.0
             now_s, before = now_s + seconds, state
+        # Between streams that do not follow each other there is a stage more in the programme than there need be.
+        longest_s = max(network.stages[index].clearance_s for index in junction.stages)
+        between = [[min(least_s, longest_s) for least_s in row] for row in between]
+        for index in junction.stages:
+            stage = network.stages[index]
+            green = [
+                min(least_s, stage.min_green_s) if letter in GREEN else least_s
+                for letter, least_s in zip(stage.state, green, strict=True)
+            ]
         # What the programme never shows it asks nothing of.
         shown = [[0.0 if math.isinf(least_s) else least_s for least_s in row] for row in (green, yellow, *between)]
         return cls(shown[0], shown[1], shown[2:])

@@ -19,8 +19,10 @@ import numpy as np
 
 from utn_sumo import detectors
 from utn_sumo.case import Case
-from utn_sumo.contract import SAMPLE_S, Floats, Measurement, Network, Plan
+from utn_sumo.contract import SAMPLE_S, Execution, Floats, Measurement, Network, Plan, State
 from utn_sumo.errors import PlantError
+from utn_sumo.plant.eyes import Eyes
+from utn_sumo.plant.heads import Heads
 from utn_sumo.signals import cycle_phases
 
 PROGRAM = "utn"
@@ -51,8 +53,19 @@ class SumoPlant:
 
     _owner: SumoPlant | None = None
 
-    def __init__(self, network: Network, routes: Path | Case, folder: Path, *, seed: int, duration_s: float):
+    def __init__(
+        self,
+        network: Network,
+        routes: Path | Case,
+        folder: Path,
+        *,
+        seed: int,
+        duration_s: float,
+        execution: Execution | None = None,
+    ):
         """`folder` takes SUMO's own outputs: trips.xml, signals.xml (every switch), sumo.log.
+
+        With an `execution` that carries the plans out, else they are shown to the second.
 
         With a case for `routes` its files, its window's begin and its other options are SUMO's; times count from there.
         """
@@ -66,11 +79,18 @@ class SumoPlant:
         """SUMO's time at our 0."""
         self.sumo_time_s = 0.0
         """Wall time spent inside SUMO: start, steps, close."""
+        self.decision_time_s = 0.0
+        """Wall time of the execution's decisions, reading what they are made by included."""
         self.truth: Truth | None = None
         self._ids = detectors.ids(network)
         self._entered: list[tuple[float, Floats]] = []
         """(time, what the entry loops have counted since the control step began) at each reading."""
         self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
+        self._execution = execution
+        self._heads = Heads(network, self._show)
+        self._eyes = Eyes(network, self._ids)
+        self._decision_s = 0.0
+        """When the execution is asked next."""
         self._sumo: Any = None
         self._places: dict[str, list[tuple[Any, str]]] = {}
         """Of each edge what SUMO counts its motor vehicles by: the edge as a whole, or some of its lanes."""
@@ -131,11 +151,12 @@ class SumoPlant:
         """SUMO's own version string."""
         return str(self._sumo.getVersion()[1])
 
-    def run(self, plan: Plan) -> Measurement:
+    def run(self, plan: Plan, state: State | None = None) -> Measurement:
         """Run one control step under `plan` and return what the detectors saw.
 
         Each junction takes the plan over where its own cycle begins, and repeats it if its cycle is
-        shorter than the control step. Raises PlantError if SUMO breaks off.
+        shorter than the control step; an execution makes of it what it likes, and of the `state` that it was made from.
+        Raises PlantError if SUMO breaks off.
         """
         end_s = min(self.time_s + self.network.control_step_s, self.duration_s)
         peak_x = np.zeros(len(self.network.links))
@@ -143,20 +164,22 @@ class SumoPlant:
         try:
             spent_veh_s = 0.0
             self._entered = [(self.time_s, np.zeros(len(self.network.links)))]
+            if self._execution is not None and state is not None:
+                self._execution.begin(plan, state)
+                self._eyes.x_veh = state.x_veh
             while self.time_s < end_s:
                 before_s = self.time_s
-                for index, boundary_s in enumerate(self._boundary_s):
-                    if boundary_s == self.time_s:
-                        self._hand_over(index, plan.green_s)
-                        self._boundary_s[index] += self.network.junctions[index].cycle_s
+                switched_s = self._switch(plan) if self._execution is None else self._decide(self._execution)
                 sample_s = (self.time_s // SAMPLE_S + 1) * SAMPLE_S
-                self.time_s = min([sample_s, end_s, *self._boundary_s])
+                self.time_s = min(sample_s, end_s, switched_s)
                 self._step()
+                if self._execution is not None and self.time_s % SAMPLE_S and self.time_s < end_s:
+                    spent_veh_s += self._present() * (self.time_s - before_s)
+                    continue
                 self._entered.append((self.time_s, self._entered_so_far()))
                 x_veh = self._by_link("getLastStepVehicleNumber")
                 np.maximum(peak_x, x_veh, out=peak_x)
-                present = self._sumo.vehicle.getIDCount() + len(self._sumo.simulation.getPendingVehicles())
-                spent_veh_s += present * (self.time_s - before_s)
+                spent_veh_s += self._present() * (self.time_s - before_s)
                 queue_veh = self._by_link("getLastStepHaltingNumber")
                 np.maximum(peak_queue, queue_veh, out=peak_queue)
             pending = self._sumo.edge.getPendingVehicles
@@ -199,6 +222,38 @@ class SumoPlant:
         started = time.perf_counter()
         self._sumo.simulationStep(self.begin_s + self.time_s)
         self.sumo_time_s += time.perf_counter() - started
+
+    def _switch(self, plan: Plan) -> float:
+        """Hand the plan over where a cycle begins now; when the next one does."""
+        for index, boundary_s in enumerate(self._boundary_s):
+            if boundary_s == self.time_s:
+                self._hand_over(index, plan.green_s)
+                self._boundary_s[index] += self.network.junctions[index].cycle_s
+        return min(self._boundary_s)
+
+    def _decide(self, execution: Execution) -> float:
+        """Ask the execution if it is time, and show what is due; when there is something to do next."""
+        started = time.perf_counter()
+        heads = self._heads
+        if self.time_s == 0:
+            heads.start(self.time_s)
+        heads.advance(self.time_s)
+        if self.time_s >= self._decision_s:
+            free = heads.free(self.time_s)
+            if free.any():
+                view = self._eyes.look(self._sumo, self.time_s, heads, free)
+                wish = heads.patient(execution.wish(view), view)
+                for index in np.flatnonzero(free & (wish != heads.stage)):
+                    heads.switch(int(index), int(wish[index]), self.time_s)
+            self._decision_s += execution.every_s
+        self.decision_time_s += time.perf_counter() - started
+        return min(self._decision_s, heads.next_s())
+
+    def _show(self, index: int, state: str) -> None:
+        self._sumo.trafficlight.setRedYellowGreenState(self.network.junctions[index].id, state)
+
+    def _present(self) -> int:
+        return int(self._sumo.vehicle.getIDCount()) + len(self._sumo.simulation.getPendingVehicles())
 
     def _hand_over(self, index: int, green_s: Floats) -> None:
         lights = self._sumo.trafficlight

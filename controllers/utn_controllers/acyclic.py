@@ -1,0 +1,186 @@
+"""Acyclic rules: whichever stage is worth most now, decided anew every few seconds by what is to be seen before it.
+
+They plan nothing: the plan that goes with them is the equal split, which nobody carries out.
+
+max_wave       the stage with most vehicles approaching (RESCO's MAXWAVE)
+max_pressure   the stage with most pressure: vehicles before it less those behind it (Varaiya 2013)
+priced         the stage that gains most by the vehicles that it can move within a short horizon, at prices of the links
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from utn_controllers.fixed_time import FixedTime
+from utn_sumo.contract import EXIT, Floats, Ints, Network, Plan, State, View
+
+
+class Acyclic:
+    """Shows the stage of most worth at every junction. What that is, a subclass says."""
+
+    def __init__(self, network: Network, every_s: float):
+        self.network = network
+        self.every_s = every_s
+        self.fraction = network.fraction
+        self._best = _Best(network)
+
+    def begin(self, plan: Plan, state: State) -> None:  # noqa: ARG002 - it has no use for a plan
+        """Take up the turning fractions as they are at present."""
+        self.fraction = state.fraction
+
+    def wish(self, view: View) -> Ints:
+        """(J,) the stage of most worth; the present one where none is worth more."""
+        return self._best.stages(self.worth(view), view.stage)
+
+    def worth(self, view: View) -> Floats:
+        """(S,) what each stage is worth at this moment."""
+        raise NotImplementedError
+
+    def by_turn(self, groups: Floats) -> Floats:
+        """(M,) of numbers by lane group (G,) each turn's share, as the traffic of the group turns."""
+        group = self.network.turn_group
+        total = np.bincount(group, self.fraction, len(self.network.groups))[group]
+        return np.asarray(groups[group] * self.fraction / np.maximum(total, 1e-9))
+
+
+class _Best:
+    """Finds the best stage of every junction at once."""
+
+    def __init__(self, network: Network):
+        self._order = np.concatenate([junction.stages for junction in network.junctions]).astype(np.int64)
+        counts = [len(junction.stages) for junction in network.junctions]
+        self._starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+        self._counts = np.array(counts)
+
+    def stages(self, worth: Floats, present: Ints) -> Ints:
+        """(J,) stage of most `worth` (S,); the `present` (J,) where none is worth more, else the first of equals."""
+        ordered = worth[self._order]
+        most = np.maximum.reduceat(ordered, self._starts)
+        at = np.where(ordered >= np.repeat(most, self._counts), np.arange(len(ordered)), len(ordered))
+        first = self._order[np.minimum.reduceat(at, self._starts)]
+        return np.where((worth[present] >= most) & (most > 0), present, first)
+
+
+class WaveSettings(BaseModel):
+    """Settings of `max_wave`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    every_s: float = Field(5.0, ge=1, le=60)
+    """Time between two decisions [s]."""
+
+
+class MaxWave(FixedTime):
+    """Shows the stage with most vehicles approaching, every few seconds anew."""
+
+    Settings = WaveSettings
+
+    def __init__(self, network: Network, **settings: float):
+        super().__init__(network)
+        self.execution = _Wave(network, WaveSettings(**settings).every_s)
+
+
+class _Wave(Acyclic):
+    def worth(self, view: View) -> Floats:
+        return np.asarray(self.network.serves @ self.by_turn(view.near_veh))
+
+
+class PressureSettings(WaveSettings):
+    """Settings of `max_pressure`."""
+
+    count: Literal["waiting", "near"] = "waiting"
+    """Vehicles that make the pressure: those that stand, or all in view."""
+    per: Literal["lane", "storage", "none"] = "lane"
+    """What they are divided by."""
+
+
+class MaxPressure(FixedTime):
+    """Shows the stage with most pressure, vehicles before it less vehicles behind it, every few seconds anew."""
+
+    Settings = PressureSettings
+
+    def __init__(self, network: Network, **settings: float | str):
+        super().__init__(network)
+        self.execution = _Pressure(network, PressureSettings(**settings))  # type: ignore[arg-type]
+
+
+class _Pressure(Acyclic):
+    def __init__(self, network: Network, settings: PressureSettings):
+        super().__init__(network, settings.every_s)
+        self._near = settings.count == "near"
+        lanes = np.array([len(group.lanes) for group in network.groups], dtype=float)
+        room = {"lane": lanes, "none": np.ones(len(lanes)), "storage": lanes}[settings.per]
+        if settings.per == "storage":
+            by_link = np.bincount(network.group_link, lanes, len(network.links))
+            room = network.storage_veh[network.group_link] * lanes / by_link[network.group_link]
+        self._room = room
+        self._fed = (network.turn_next != EXIT).astype(float)
+        self._next = np.maximum(network.turn_next, 0)
+
+    def worth(self, view: View) -> Floats:
+        net = self.network
+        veh = view.near_veh if self._near else view.waiting_veh
+        before = self.by_turn(veh / self._room)
+        by_link = np.bincount(net.group_link, veh / self._room, len(net.links))
+        behind = self._fed * by_link[self._next] * self.fraction
+        flow = self.by_turn(net.group_saturation_flow_veh_s)
+        return np.asarray(net.serves @ (flow * (before - behind)))
+
+
+class PricedSettings(WaveSettings):
+    """Settings of `priced`, found on `utn17` at demands 0.6, 1.0 and 1.3 with seed 1."""
+
+    horizon_s: float = Field(15.0, gt=0)
+    """How far ahead a stage is judged [s]; another than the present one loses its clearance of it."""
+    crowding: float = Field(0.5, ge=0)
+    """By how much a full link is dearer than an empty one, in vehicles."""
+    full: float = Field(0.6, gt=0)
+    """Share of its storage from which a link is fed no more: beyond it some lane is full and stops the junction."""
+
+
+class Priced(FixedTime):
+    """Shows the stage that gains most: by the vehicles that it can move in a short horizon, at prices of the links."""
+
+    Settings = PricedSettings
+
+    def __init__(self, network: Network, **settings: float):
+        super().__init__(network)
+        self.execution = _Priced(network, PricedSettings(**settings))
+
+
+class _Priced(Acyclic):
+    """A link costs the more the fuller it is, and what a stage moves gains the difference, as pressure does.
+
+    Into a full link nothing is gained. A stage is judged by whom it can let through within the horizon, so that among
+    queues that all fill it the present stage goes on, which has no clearance to wait for; where few are about, the
+    stage with most of them comes next.
+    """
+
+    def __init__(self, network: Network, settings: PricedSettings):
+        super().__init__(network, settings.every_s)
+        self.settings = settings
+        self._fed = network.turn_next != EXIT
+        self._next = np.maximum(network.turn_next, 0)
+        self._stage, self._turn = np.nonzero(network.serves)
+
+    def worth(self, view: View) -> Floats:
+        net, settings = self.network, self.settings
+        taken = view.x_veh / net.storage_veh
+        ahead = np.where(self._fed, taken[self._next], 0.0)
+        gain = np.maximum(1 + settings.crowding * (taken[net.turn_link] - ahead), 0.0)
+        gain[self._fed & (taken[self._next] > settings.full)] = 0.0
+        lost_s = net.clearance_s[view.stage][net.stage_junction]
+        lost_s[view.stage] = 0.0
+        open_s = np.maximum(settings.horizon_s - lost_s, 1.0)
+        near = self.by_turn(view.near_veh)
+        most = self.by_turn(net.group_saturation_flow_veh_s)
+        stage, turn = self._stage, self._turn
+        moved = np.minimum(near[turn], open_s[stage] * most[turn]) + TIE_SHARE * near[turn]
+        return np.asarray(np.bincount(stage, gain[turn] * moved, len(net.stages)), dtype=float)
+
+
+TIE_SHARE = 1e-3
+"""What vehicles beyond the horizon count: who is equal within it is told apart by the longer queue."""

@@ -1,0 +1,87 @@
+"""From any stage to any other: the yellow and the red between them, by the times that the net itself keeps.
+
+To the stage that follows in the net's own programme it is the net's own clearance, to the second. To another one it is
+made: who loses green has the yellow that the net gives it, who gains green waits as long after each conflicting stream
+as the net has them wait, or the longest that the junction has where the net never shows the two in turn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from utn_sumo.contract import Floats, Junction, Network
+
+GREEN, YELLOW = "Gg", "yY"
+USUAL_YELLOW_S = 3.0
+
+Phases = tuple[tuple[str, float], ...]
+"""(letters, seconds), shown in turn."""
+
+
+@dataclass(frozen=True)
+class Times:
+    """What a junction's own programme keeps."""
+
+    yellow_s: Floats
+    """(letters,) after each signal's green."""
+    between_s: Floats
+    """(letters, letters) from the end of one's green to the begin of another's."""
+
+    @classmethod
+    def of(cls, network: Network, junction: Junction) -> Times:
+        """Read off its programme with every stage as short as it may be, round the cycle."""
+        shown: list[str] = []
+        for index in junction.stages:
+            stage = network.stages[index]
+            for state, seconds in ((stage.state, stage.min_green_s), *stage.clearance):
+                shown += [state] * round(seconds)
+        letters, seconds = len(shown[0]), len(shown)
+        green = np.array([[letter in GREEN for letter in state] for state in shown])
+        yellow = np.array([[letter in YELLOW for letter in state] for state in shown])
+        ends = [np.flatnonzero(green[:, a] & ~np.roll(green[:, a], -1)) for a in range(letters)]
+        begins = [np.flatnonzero(green[:, a] & ~np.roll(green[:, a], 1)) for a in range(letters)]
+        yellow_s = np.full(letters, np.nan)
+        between_s = np.full((letters, letters), np.nan)
+        for a in range(letters):
+            for end in ends[a]:
+                after = np.roll(yellow[:, a], -end - 1)
+                yellow_s[a] = np.fmax(yellow_s[a], seconds if after.all() else int(np.argmin(after)))
+            for b in range(letters):
+                gaps = [(begin - end - 1) % seconds for end in ends[a] for begin in begins[b]]
+                if gaps:
+                    between_s[a, b] = min(gaps)
+        usual = np.nanmax(yellow_s) if np.isfinite(yellow_s).any() else USUAL_YELLOW_S
+        return cls(np.where(np.isnan(yellow_s), usual, yellow_s), between_s)
+
+
+def between(network: Network, junction: Junction, times: Times, first: int, then: int) -> Phases:
+    """What a junction shows from the end of the stage `first` until the stage `then` begins."""
+    order = junction.stages
+    if order[(order.index(first) + 1) % len(order)] == then:
+        return network.stages[first].clearance
+    was, becomes = network.stages[first].state, network.stages[then].state
+    closing = [a for a, letter in enumerate(was) if letter in GREEN and becomes[a] not in GREEN]
+    opening = [b for b, letter in enumerate(becomes) if letter in GREEN and was[b] not in GREEN]
+    longest_s = max((network.stages[stage].clearance_s for stage in order), default=0.0)
+    needed_s = [0.0]
+    for a in closing:
+        needed_s += [times.yellow_s[a] * (a not in junction.without_yellow)]
+        for b in opening:
+            if junction.conflicts[a][b]:
+                # Known gaps are of streams that follow each other; longer ones have other stages in between.
+                needed_s.append(min(longest_s, np.nan_to_num(times.between_s[a, b], nan=longest_s)))
+    seconds = math.ceil(max(needed_s))
+
+    def letter(signal: int, second: int) -> str:
+        if signal in closing:
+            return "y" if second < times.yellow_s[signal] and signal not in junction.without_yellow else "r"
+        if was[signal] in GREEN:
+            return "G" if was[signal] == becomes[signal] == "G" else "g"
+        return "r" if becomes[signal] in GREEN else becomes[signal]
+
+    states = ["".join(letter(signal, second) for signal in range(len(was))) for second in range(seconds)]
+    return tuple((state, float(len(list(group)))) for state, group in groupby(states))

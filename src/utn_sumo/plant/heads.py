@@ -1,0 +1,115 @@
+"""Signal heads that are switched from stage to stage, second by second: whatever the wish, never without clearance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from utn_sumo import clearances
+from utn_sumo.clearances import Phases, Times
+from utn_sumo.contract import Bools, Floats, Ints, Network, Stage, View
+
+MOST_PATIENCE_S = 150.0
+"""A stage that somebody has waited for so long comes next, whatever is wished."""
+
+
+class Heads:
+    """The signals of a network: the stage of each junction, or the clearance on the way to it."""
+
+    def __init__(self, network: Network, show: Callable[[int, str], None]):
+        """`show` puts letters on the signals of a junction."""
+        self.network = network
+        self._show = show
+        self.stage: Ints = np.array([junction.stages[0] for junction in network.junctions], dtype=np.int64)
+        """(J,) stage that each junction shows, or is on its way to."""
+        self.begin_s = np.zeros(len(network.junctions))
+        """(J,) when it began, or will."""
+        self.red_since_s = np.zeros(len(network.stages))
+        """(S,) when each stage last ended."""
+        self._ways: dict[tuple[int, int], Phases] = {}
+        self._times = [Times.of(network, junction) for junction in network.junctions]
+        self._called_s = np.zeros(len(network.stages))
+        """(S,) since when somebody has been waiting for each stage."""
+        self._due: list[list[tuple[float, str]]] = [[] for _ in network.junctions]
+        """(time, letters) still to be shown, by junction."""
+        self._served = (network.serves.astype(float) @ _turn_groups(network)) > 0
+        """(S, G) lane groups that a stage lets go."""
+        self._walked = np.array(
+            [
+                any(
+                    stage.state[letter] in clearances.GREEN
+                    for letter in network.junctions[stage.junction].without_yellow
+                )
+                for stage in network.stages
+            ]
+        )
+        """(S,) stages in which pedestrians go, whom no detector sees."""
+
+    def start(self, now_s: float) -> None:
+        """Show every junction's first stage."""
+        self.begin_s[:] = now_s
+        for index, stage in enumerate(self.stage):
+            self._show(index, self.network.stages[stage].state)
+
+    def next_s(self) -> float:
+        """When the next letters are due."""
+        return min((due[0][0] for due in self._due if due), default=np.inf)
+
+    def advance(self, now_s: float) -> None:
+        """Show the letters that are due by now."""
+        for index, due in enumerate(self._due):
+            while due and due[0][0] <= now_s:
+                self._show(index, due.pop(0)[1])
+
+    def free(self, now_s: float) -> Bools:
+        """(J,) junctions whose stage has had its least green: they may go on to another."""
+        return now_s - self.begin_s >= self.network.min_green_s[self.stage]
+
+    def green_s(self, now_s: float) -> Floats:
+        """(J,) how long each junction's stage has been green."""
+        return np.maximum(now_s - self.begin_s, 0.0)
+
+    def red_s(self, now_s: float) -> Floats:
+        """(S,) how long each stage has been without green; 0 for those that have it."""
+        red = now_s - self.red_since_s
+        red[self.stage] = 0.0
+        return red
+
+    def patient(self, wish: Ints, view: View) -> Ints:
+        """(J,) the wish, but for stages that somebody has waited for too long: these come next, the longest first."""
+        called = self._walked | (self._served @ view.waiting_veh > 0)
+        called[view.stage] = False
+        self._called_s[~called] = view.time_s
+        waited_s = view.time_s - self._called_s
+        kept = wish.copy()
+        for stage in sorted(np.flatnonzero(waited_s >= MOST_PATIENCE_S), key=lambda stage: waited_s[stage]):
+            kept[self.network.stages[stage].junction] = stage
+        return kept
+
+    def switch(self, index: int, stage: int, now_s: float) -> None:
+        """Lead a junction that is free to another of its stages."""
+        first = int(self.stage[index])
+        if (first, stage) not in self._ways:
+            junction = self.network.junctions[index]
+            self._ways[first, stage] = clearances.between(self.network, junction, self._times[index], first, stage)
+        at_s, due = now_s, []
+        for state, seconds in self._ways[first, stage]:
+            due.append((at_s, state))
+            at_s += seconds
+        due.append((at_s, self.network.stages[stage].state))
+        self._due[index] = due
+        self.red_since_s[first] = now_s
+        self.stage[index], self.begin_s[index] = stage, at_s
+        self.advance(now_s)
+
+
+def _turn_groups(network: Network) -> Floats:
+    """(M, G) 1 where a turn queues in a lane group."""
+    return np.equal.outer(network.turn_group, np.arange(len(network.groups))).astype(float)
+
+
+def _is_walked(network: Network, stage: Stage) -> bool:
+    """Whether a stage has green for letters that are no vehicles'."""
+    letters = network.junctions[stage.junction].without_yellow
+    return any(stage.state[letter] in clearances.GREEN for letter in letters)
