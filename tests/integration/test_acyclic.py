@@ -10,8 +10,8 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
-
 from tests.integration import odd_nets
+
 from utn_sumo import bridge, monitor, replay
 from utn_sumo.contract import Network
 from utn_sumo.errors import SettingError
