@@ -21,6 +21,7 @@ from utn_sumo import (
     demand,
     metrics,
     monitor,
+    quiet,
     recording,
     streets,
     sumo_signals,
@@ -70,9 +71,7 @@ def run(
     steps = int(np.ceil(duration_s / step_s))
     driving = chosen or traffic.drawn(scenario, net)
     folder = recording.new_folder(folder, _default_name(scenario))
-    if isinstance(driving, Path):
-        driving = Path(shutil.copyfile(driving, folder / "routes.rou.xml"))
-        shutil.copyfile(net.net_file, folder / "net.net.xml")
+    driving = _kept(driving, net, folder)
     predictor = _predictor(net, scenario, driving, steps)
     # Of other people's vehicles some start amid links, and nobody says how many.
     disturbance_veh = scenario.disturbance * scenario.demand * step_s / 3600 if chosen is None else UNKNOWN_VEH
@@ -97,7 +96,7 @@ def run(
     ):
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
-        recorder = recording.Recorder(folder, _settings(scenario, chosen, plant.version))
+        recorder = recording.Recorder(folder, _settings(scenario, driving, plant.version))
         state = estimator.initial()
         try:
             for step in range(steps):
@@ -231,8 +230,16 @@ def _default_name(scenario: Scenario) -> str:
     return f"{net}-{controller}-demand{scenario.demand:g}-seed{scenario.seed}"
 
 
-def _settings(scenario: Scenario, chosen: Case | None, sumo: str) -> dict[str, Any]:
-    brought = {} if chosen is None else {"case": chosen.record()}
+def _kept(driving: Path | Case, net: Network, folder: Path) -> Path | Case:
+    """What the run is made from, as its folder keeps it."""
+    if isinstance(driving, Case):
+        return quiet.silenced(driving, folder)
+    shutil.copyfile(net.net_file, folder / "net.net.xml")
+    return Path(shutil.copyfile(driving, folder / "routes.rou.xml"))
+
+
+def _settings(scenario: Scenario, driving: Path | Case, sumo: str) -> dict[str, Any]:
+    brought = {"case": driving.record()} if isinstance(driving, Case) else {}
     return {"scenario": scenario.model_dump(), **brought, "versions": _versions(sumo)}
 
 

@@ -10,7 +10,6 @@ model.json, map.png     the bench's view of the net
 
 from __future__ import annotations
 
-import gzip
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -20,9 +19,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-from defusedxml import ElementTree
-
-from utn_sumo import calibration, case, detectors, inspection, network, plots, recording, routes, streets, study
+from utn_sumo import calibration, case, detectors, inspection, network, plots, quiet, recording, routes, streets, study
 from utn_sumo.case import Case
 from utn_sumo.contract import Network
 from utn_sumo.network import Traffic
@@ -30,17 +27,6 @@ from utn_sumo.network import Traffic
 SCENARIO, DETECTORS, MODEL, MAP = "scenario.sumocfg", "detectors.add.xml", "model.json", "map.png"
 TURNS, FITTED = ".turns.xml", ".calibration.json"
 """Endings of what goes with a net under its name."""
-WRITES = {"timedEvent": "dest", "calibrator": "output"} | dict.fromkeys(
-    (
-        *("inductionLoop", "e1Detector", "instantInductionLoop", "laneAreaDetector", "e2Detector", "entryExitDetector"),
-        *("e3Detector", "edgeData", "laneData", "meandata", "routeProbe", "vTypeProbe"),
-    ),
-    "file",
-)
-"""Elements of additional files that have SUMO write a file, and the attribute that names it."""
-SIGNS = (b"<include", b"file=", b"dest=", b"output=")
-"""What a file holds that names other files."""
-NOWHERE = "NUL"
 CALIBRATED_AT = (1.0,)
 """Demands of the runs that a calibration is made from: the scenario's own."""
 
@@ -150,23 +136,13 @@ class _Copies:
         return self.names[original]
 
     def _mend(self, original: Path, target: Path) -> None:
-        with gzip.open(original) if original.suffix == ".gz" else original.open("rb") as file:
-            # Route files may be large: only what may need it is read as a whole.
-            if not any(word in line for line in file for word in SIGNS):
-                shutil.copyfile(original, target)
-                return
-            file.seek(0)
-            tree = ElementTree.parse(file, forbid_dtd=True)
-        for element in tree.iter():
-            written = WRITES.get(element.tag, "")
-            read = "href" if element.tag == "include" else "file"
-            if written in element.attrib:
-                element.set(written, NOWHERE)
-            elif (original.parent / element.get(read, "")).is_file():
-                inside = original.parent / element.get(read)
-                element.set(read, self.mended(inside) if element.tag == "include" else self.of(inside))
-        with gzip.open(target, "wb") if target.suffix == ".gz" else target.open("wb") as file:
-            tree.write(file, encoding="utf-8", xml_declaration=True)
+        tree = quiet.parsed(original)
+        # Route files may be large: only what may need it is read as a whole.
+        if tree is None:
+            shutil.copyfile(original, target)
+            return
+        quiet.mend(tree, original, included=self.mended, read=self.of)
+        quiet.write(tree, target)
 
 
 def _write_scenario(path: Path, chosen: Case, copies: _Copies) -> None:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from utn_sumo import metrics, monitor, recording, streets, traffic
+from utn_sumo import metrics, monitor, quiet, recording, streets, traffic
 from utn_sumo.case import SUFFIX, Case
 from utn_sumo.contract import Network
 from utn_sumo.errors import UtnError
@@ -59,6 +59,7 @@ def measured(
     started = time.perf_counter()
     name = f"{Path(scenario.net).name.partition('.')[0]}-{scenario.controller}-seed{scenario.seed}"
     folder = recording.new_folder(folder, name)
+    chosen = quiet.silenced(chosen, folder)
     if programmes is not None:
         added = folder / PROGRAMMES
         added.write_text(programmes, encoding="utf-8")

@@ -288,3 +288,19 @@ def test_published_delays_of_own_programmes_are_found_again(
         pytest.skip(f"{file} is not here")
     result = bridge.run(scenario(net=str(file), controller="native", seed=1), tmp_path / "run")
     assert result["mean_delay_s"] == pytest.approx(delay_s, abs=spread_s)
+
+
+def test_what_its_additional_files_would_write_goes_nowhere(town: Path, tmp_path: Path) -> None:
+    loop = '<inductionLoop id="{}" lane="1_0" pos="10" period="60" file="{}"/>'
+    inner, outer = loop.format("inner", "in.xml"), loop.format("outer", "out.xml")
+    town.with_name("inner.add.xml").write_text(f"<additional>{inner}</additional>", encoding="utf-8")
+    added = f'<additional><include href="inner.add.xml"/>{outer}</additional>'
+    town.with_name("outer.add.xml").write_text(added, encoding="utf-8")
+    text = town.read_text(encoding="utf-8").replace("</input>", '<additional-files value="outer.add.xml"/></input>')
+    town.write_text(text, encoding="utf-8")
+    before = {path.name for path in tmp_path.iterdir()}
+    for controller in ("native", "fixed"):
+        bridge.run(scenario(net=str(town), controller=controller, seed=9), tmp_path / controller)
+        before.add(controller)
+        assert {path.name for path in tmp_path.iterdir()} == before
+    assert trips(tmp_path / "native" / "trips.xml") == by_bare_sumo(town, tmp_path, 9)
