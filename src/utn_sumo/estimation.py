@@ -83,7 +83,6 @@ class Estimator:
         """(G,) vehicles that the part of each lane group in view holds."""
         self._before_veh = self._watched_veh * before_m / lane_m
         """(Z,) vehicles that the part in view before the lanes part holds."""
-        self._crowded_before = np.zeros(links)
         hidden_s = np.maximum(length_m - AREA_REACH_M, 0) / speed_m_s
         self._hidden = share_on_the_way(hidden_s, network.sample_s, known.delay_samples)
         """(H, Z) share of each past sample's inflow that has not come into view, on a free road."""
@@ -125,10 +124,7 @@ class Estimator:
         covariance[:, 2, 2] += self._disturbance_step_variance
 
         hidden = (self._hidden * self._past_inflow_veh).sum(axis=0)
-        # Who stood beyond the view when the last step ended may not have come into it yet.
-        crowded = self._crowded(seen)
-        crowd = (np.maximum(crowded, self._crowded_before) - QUIET_SHARE) / (CROWDED_SHARE - QUIET_SHARE)
-        self._crowded_before = crowded
+        crowd = (self._crowded(seen) - QUIET_SHARE) / (CROWDED_SHARE - QUIET_SHARE)
         quiet = crowd < 1
         variance = SEEN_SD_VEH**2 + (SEEN_SD_SHARE * hidden) ** 2 + (CROWDED_SD_VEH * np.maximum(crowd, 0.0)) ** 2
         # Where side roads meet a link before what is watched of it, who came there may not be in view yet.
