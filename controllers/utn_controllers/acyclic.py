@@ -131,13 +131,13 @@ class _Pressure(Acyclic):
 
 
 class PricedSettings(WaveSettings):
-    """Settings of `priced`, found on `utn17` at demands 0.6, 1.0 and 1.3 with seed 1."""
+    """Settings of `priced`, found on `utn17` at demands 0.6, 1.0 and 1.3 with seeds 1 to 3."""
 
     horizon_s: float = Field(15.0, gt=0)
     """How far ahead a stage is judged [s]; another than the present one loses its clearance of it."""
-    crowding: float = Field(0.5, ge=0)
+    crowding: float = Field(2.0, ge=0)
     """By how much a full link is dearer than an empty one, in vehicles."""
-    full: float = Field(0.6, gt=0)
+    full: float = Field(0.5, gt=0)
     """Share of its storage from which a link is fed no more: beyond it some lane is full and stops the junction."""
 
 

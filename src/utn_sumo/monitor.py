@@ -39,8 +39,13 @@ class Verdict:
             self.reasons.append(f"{junction} at {second} s: {reason}")
 
 
-def watch(network: Network, switches: Path, duration_s: float, begin_s: float = 0.0) -> Verdict:
+def watch(
+    network: Network, switches: Path, duration_s: float, begin_s: float = 0.0, *, in_order: bool = True
+) -> Verdict:
     """Judge a run that began at `begin_s` by its record of signal switches (SUMO's SaveTLSSwitchStates).
+
+    Stages are to come in the net's own order, or else in any: then a green need last for one stage only, and between
+    two streams no more than the junction's longest clearance.
 
     Unsafe is: two conflicting streams with a protected green, or one with it while another's is still being cleared; a
     green that ends without its full yellow; a conflicting green before the clearance that the net prescribes between
@@ -50,7 +55,10 @@ def watch(network: Network, switches: Path, duration_s: float, begin_s: float = 
     verdict = Verdict()
     for junction in network.junctions:
         switched = [(second - int(begin_s), state) for second, state in shown.get(junction.id, [])]
-        _Guard(network, junction, verdict).judge(_stretches(switched, int(duration_s)))
+        rules = (
+            _Rules.of(network, junction) if in_order else _Rules.of(network, junction).in_any_order(network, junction)
+        )
+        _Guard(network, junction, rules, verdict).judge(_stretches(switched, int(duration_s)))
     return verdict
 
 
@@ -113,27 +121,28 @@ class _Rules:
                 lit[signal] = (lit[signal] if was in GREEN else 0.0) + seconds if now in GREEN else 0.0
                 amber[signal] = (amber[signal] if was in YELLOW else 0.0) + seconds if now in YELLOW else 0.0
             now_s, before = now_s + seconds, state
-        # Between streams that do not follow each other there is a stage more in the programme than there need be.
-        longest_s = max(network.stages[index].clearance_s for index in junction.stages)
-        between = [[min(least_s, longest_s) for least_s in row] for row in between]
-        for index in junction.stages:
-            stage = network.stages[index]
-            green = [
-                min(least_s, stage.min_green_s) if letter in GREEN else least_s
-                for letter, least_s in zip(stage.state, green, strict=True)
-            ]
         # What the programme never shows it asks nothing of.
         shown = [[0.0 if math.isinf(least_s) else least_s for least_s in row] for row in (green, yellow, *between)]
         return cls(shown[0], shown[1], shown[2:])
+
+    def in_any_order(self, network: Network, junction: Junction) -> _Rules:
+        """The same for stages in any order: what the programme has beyond one stage, or one clearance, need not be."""
+        stages = [network.stages[index] for index in junction.stages]
+        longest_s = max(stage.clearance_s for stage in stages)
+        green = [
+            min([least_s, *(stage.min_green_s for stage in stages if stage.state[signal] in GREEN)])
+            for signal, least_s in enumerate(self.green_s)
+        ]
+        return _Rules(green, self.yellow_s, [[min(least_s, longest_s) for least_s in row] for row in self.between_s])
 
 
 class _Guard:
     """Follows the signals of one junction through the seconds of a run."""
 
-    def __init__(self, network: Network, junction: Junction, verdict: Verdict) -> None:
+    def __init__(self, network: Network, junction: Junction, rules: _Rules, verdict: Verdict) -> None:
         self.junction = junction
         self.verdict = verdict
-        self.rules = _Rules.of(network, junction)
+        self.rules = rules
         self.under_way = junction.offset_s % junction.cycle_s > 0
         """Whether a cycle is under way when the run begins: how long its green or yellow has lasted nobody saw."""
         last = network.stages[junction.stages[-1]]

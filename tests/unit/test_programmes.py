@@ -113,7 +113,7 @@ def test_a_programme_that_shows_one_thing_only_has_one_stage() -> None:
 def test_a_stage_lasts_what_mindur_says_but_no_more_than_the_net_shows(
     duration_s: float, least_s: float | None, expected_s: float
 ) -> None:
-    assert Block(Phase("Gr", duration_s, least_s), ()).min_green_s == expected_s
+    assert Block(Phase("Gr", duration_s, least_s), ()).min_green_s(MIN_GREEN_S) == expected_s
 
 
 def test_the_leasts_of_phases_alike_in_a_row_add_up() -> None:
@@ -150,8 +150,8 @@ def test_every_stage_is_plain_green_that_somebody_can_use(shown: list[tuple[int,
     for block in found.blocks:
         assert block.stage.is_plain_green
         assert block.stage.duration_s >= SHORTEST_STAGE_S
-        assert 1 <= block.min_green_s <= math.ceil(block.stage.duration_s)
-        assert block.min_green_s == round(block.min_green_s)
+        assert 1 <= block.min_green_s(MIN_GREEN_S) <= math.ceil(block.stage.duration_s)
+        assert block.min_green_s(MIN_GREEN_S) == round(block.min_green_s(MIN_GREEN_S))
     # Nobody who turns green, or gets protection, for five seconds or more and beside no yellow is left in a clearance.
     cleared = [phase for block in found.blocks for phase in block.clearance]
     assert not [phase for phase in cleared if phase.is_plain_green and phase.duration_s >= MIN_GREEN_S]
