@@ -21,6 +21,7 @@ from utn_sumo.errors import NetworkError
 from utn_sumo.model import LinkModel
 from utn_sumo.recording import Log
 from utn_sumo.rollout import Outside, predict, starts
+from utn_sumo.xml_files import stem
 
 STEP_S = 10.0
 """The paper's sampling interval."""
@@ -165,8 +166,7 @@ def for_model(network: Network, chosen: str | None) -> Network:
 
 def beside_net(network: Network) -> Path:
     """Where the calibration of a net lies that is taken without asking."""
-    stem = network.net_file.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net")
-    return network.net_file.with_name(f"{stem}.calibration.json")
+    return network.net_file.with_name(f"{stem(network.net_file)}.calibration.json")
 
 
 def applied(network: Network, path: Path) -> Network:

@@ -5,7 +5,6 @@ What SUMO is to write and to show is left out; that is ours to say.
 
 from __future__ import annotations
 
-import gzip
 import hashlib
 import math
 import zlib
@@ -16,6 +15,7 @@ from typing import Any
 from xml.etree.ElementTree import Element
 
 from utn_sumo.errors import SettingError
+from utn_sumo.xml_files import opened
 
 SUFFIX = ".sumocfg"
 DEFAULT_TELEPORT_S = 300.0
@@ -171,7 +171,7 @@ def elements(
     if path.resolve() in within:
         raise SettingError(f"{name} {str(path)!r} includes itself: {remedy}")
     try:
-        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        with opened(path) as file:
             above: list[Element] = []
             for event, element in ElementTree.iterparse(file, events=("start", "end"), forbid_dtd=True):
                 if event == "start":

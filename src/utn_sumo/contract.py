@@ -549,18 +549,12 @@ class View:
     """(J,) stage that each junction shows, or is on its way to."""
     free: Bools
     """(J,) junctions whose stage has had its least green."""
-    green_s: Floats
-    """(J,) how long each junction's stage has been green."""
-    red_s: Floats
-    """(S,) how long each stage has been without green."""
     waiting_veh: Floats
     """(G,) standing in the lane-area detectors, by lane group."""
     near_veh: Floats
     """(G,) in the lane-area detectors, moving or not, by lane group."""
     x_veh: Floats
     """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
-    gap_s: Floats
-    """(G,) time since a vehicle was last over a stop-line loop, the shortest of a lane group's lanes."""
 
 
 @runtime_checkable

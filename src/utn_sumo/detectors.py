@@ -40,8 +40,6 @@ class DetectorIds:
     area: tuple[tuple[str, ...], ...]
     group: tuple[tuple[str, ...], ...]
     """(G,) of the lane-area detectors those on a lane group."""
-    group_stop: tuple[tuple[str, ...], ...]
-    """(G,) of the stop-line loops those on a lane group."""
     upstream: tuple[tuple[str, ...], ...]
     """(Z,) of the lane-area detectors those before the lane groups part."""
     joining: tuple[tuple[str, ...], ...]
@@ -63,10 +61,6 @@ def ids(network: Network) -> DetectorIds:
         ),
         group=tuple(
             tuple(_named("area", f"{network.links[group.link].edges[-1]}_{lane}") for lane in group.lanes)
-            for group in network.groups
-        ),
-        group_stop=tuple(
-            tuple(_named("stop", f"{network.links[group.link].edges[-1]}_{lane}") for lane in group.lanes)
             for group in network.groups
         ),
         upstream=tuple(

@@ -23,6 +23,7 @@ from utn_sumo import calibration, case, detectors, inspection, network, plots, q
 from utn_sumo.case import Case
 from utn_sumo.contract import Network
 from utn_sumo.network import Traffic
+from utn_sumo.xml_files import stem
 
 SCENARIO, DETECTORS, MODEL, MAP = "scenario.sumocfg", "detectors.add.xml", "model.json", "map.png"
 TURNS, FITTED = ".turns.xml", ".calibration.json"
@@ -101,7 +102,7 @@ def _network(folder: Path) -> Network:
 
 def _beside(net_file: Path, ending: str) -> Path:
     """The file that goes with a net under its name."""
-    return net_file.with_name(net_file.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net") + ending)
+    return net_file.with_name(stem(net_file) + ending)
 
 
 class _Copies:

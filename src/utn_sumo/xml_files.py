@@ -10,3 +10,8 @@ from typing import IO
 def opened(path: Path) -> IO[bytes]:
     """The file, open for reading what it holds."""
     return gzip.open(path) if path.suffix == ".gz" else path.open("rb")  # type: ignore[return-value]
+
+
+def stem(net_file: Path) -> str:
+    """The name of a net file without its endings: what goes with a net lies beside it under this name."""
+    return net_file.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net")

@@ -80,12 +80,9 @@ def view(network: Network, time_s: float, stage: int, waiting: float) -> View:
         time_s=time_s,
         stage=np.array([junction.stages[stage] for junction in network.junctions]),
         free=np.ones(len(network.junctions), dtype=bool),
-        green_s=np.full(len(network.junctions), 30.0),
-        red_s=np.zeros(len(network.stages)),
         waiting_veh=nobody + waiting,
         near_veh=nobody + waiting,
         x_veh=np.zeros(len(network.links)),
-        gap_s=nobody,
     )
 
 

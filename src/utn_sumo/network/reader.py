@@ -20,7 +20,7 @@ from utn_sumo.network.programmes import MIN_GREEN_S, Block, Phase
 from utn_sumo.network.roads import Chain, Roads, for_motors, lane_groups, motor_lanes, usual_weight
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
-from utn_sumo.xml_files import opened
+from utn_sumo.xml_files import opened, stem
 
 SPACE_PER_VEHICLE_M = 7.5
 """A standing vehicle and its gap: SUMO's default 5 m + 2.5 m (SPEC 1: 2 * 400 / 7.5 = 106)."""
@@ -58,8 +58,7 @@ def load(
     if not path.is_file():
         known = did_you_mean(name, utn_network.names())
         raise NetworkError(f"net {name!r}: neither a shipped net nor a file; {known}")
-    stem = path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net")
-    return read(path, stem, left_alone, additional, traffic, usual_green_s=usual_green_s)
+    return read(path, stem(path), left_alone, additional, traffic, usual_green_s=usual_green_s)
 
 
 def read(
@@ -333,8 +332,7 @@ def _read_fractions(net_path: Path) -> dict[tuple[str, str], float]:
     from defusedxml import ElementTree  # noqa: PLC0415
     from defusedxml.common import DefusedXmlException  # noqa: PLC0415
 
-    stem = net_path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".net")
-    path = net_path.with_name(f"{stem}.turns.xml")
+    path = net_path.with_name(f"{stem(net_path)}.turns.xml")
     if not path.is_file():
         return {}
     try:

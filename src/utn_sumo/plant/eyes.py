@@ -14,7 +14,7 @@ from utn_sumo.plant.heads import Heads
 
 
 class Eyes:
-    """Reads the lane-area detectors and stop-line loops of a network."""
+    """Reads the lane-area detectors and the counting loops of a network."""
 
     def __init__(self, network: Network, ids: DetectorIds):
         self._groups = len(network.groups)
@@ -25,7 +25,6 @@ class Eyes:
         """(G,) of a link's traffic what takes the lanes of each group."""
         self._areas, self._area_group = _flat(ids.group)
         self._before, self._before_link = _flat(ids.upstream)
-        self._stops, self._stop_group = _flat(ids.group_stop)
         self._entries, self._entry_link = _flat([(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)])
         turn_exits = [
             [name for turn in np.flatnonzero(network.turn_link == link) for name in ids.turn[turn]]
@@ -39,18 +38,13 @@ class Eyes:
     def look(self, sumo: Any, time_s: float, heads: Heads, free: Bools) -> View:
         """The view at this moment. `sumo` is libsumo."""
         area, loop = sumo.lanearea, sumo.inductionloop
-        gap_s = np.full(self._groups, np.inf)
-        np.minimum.at(gap_s, self._stop_group, [loop.getTimeSinceDetection(name) for name in self._stops])
         return View(
             time_s=time_s,
             stage=heads.stage.copy(),
             free=free,
-            green_s=heads.green_s(time_s),
-            red_s=heads.red_s(time_s),
             waiting_veh=self._by_group(area.getLastStepHaltingNumber),
             near_veh=self._by_group(area.getLastStepVehicleNumber),
             x_veh=self._now_veh(time_s, loop.getIntervalVehicleNumber),
-            gap_s=gap_s,
         )
 
     def _now_veh(self, time_s: float, counted: Any) -> Floats:

@@ -25,8 +25,6 @@ class Heads:
         """(J,) stage that each junction shows, or is on its way to."""
         self.begin_s = np.zeros(len(network.junctions))
         """(J,) when it began, or will."""
-        self.red_since_s = np.zeros(len(network.stages))
-        """(S,) when each stage last ended."""
         self._ways: dict[tuple[int, int], Phases] = {}
         self._times = [Times.of(network, junction) for junction in network.junctions]
         self._called_s = np.zeros(len(network.stages))
@@ -35,15 +33,7 @@ class Heads:
         """(time, letters) still to be shown, by junction."""
         self._served = (network.serves.astype(float) @ _turn_groups(network)) > 0
         """(S, G) lane groups that a stage lets go."""
-        self._walked = np.array(
-            [
-                any(
-                    stage.state[letter] in clearances.GREEN
-                    for letter in network.junctions[stage.junction].without_yellow
-                )
-                for stage in network.stages
-            ]
-        )
+        self._walked = np.array([_is_walked(network, stage) for stage in network.stages])
         """(S,) stages in which pedestrians go, whom no detector sees."""
 
     def start(self, now_s: float) -> None:
@@ -65,16 +55,6 @@ class Heads:
     def free(self, now_s: float) -> Bools:
         """(J,) junctions whose stage has had its least green: they may go on to another."""
         return now_s - self.begin_s >= self.network.min_green_s[self.stage]
-
-    def green_s(self, now_s: float) -> Floats:
-        """(J,) how long each junction's stage has been green."""
-        return np.maximum(now_s - self.begin_s, 0.0)
-
-    def red_s(self, now_s: float) -> Floats:
-        """(S,) how long each stage has been without green; 0 for those that have it."""
-        red = now_s - self.red_since_s
-        red[self.stage] = 0.0
-        return red
 
     def patient(self, wish: Ints, view: View) -> Ints:
         """(J,) the wish, but for stages that somebody has waited for too long: these come next, the longest first."""
@@ -99,7 +79,6 @@ class Heads:
             at_s += seconds
         due.append((at_s, self.network.stages[stage].state))
         self._due[index] = due
-        self.red_since_s[first] = now_s
         self.stage[index], self.begin_s[index] = stage, at_s
         self.advance(now_s)
 
