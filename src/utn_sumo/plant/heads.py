@@ -12,6 +12,8 @@ from utn_sumo.contract import Bools, Floats, Ints, Network, Stage, View
 
 MOST_PATIENCE_S = 150.0
 """A stage that somebody has waited for so long comes next, whatever is wished."""
+LOOK_S = 5.0
+"""Time between two looks at who waits."""
 
 
 class Heads:
@@ -29,6 +31,10 @@ class Heads:
         self._times = [Times.of(network, junction) for junction in network.junctions]
         self._called_s = np.zeros(len(network.stages))
         """(S,) since when somebody has been waiting for each stage."""
+        self._look_s = 0.0
+        """When it is looked again who waits."""
+        self._overdue: list[int] = []
+        """Stages that somebody has waited for too long, the longest last."""
         self._due: list[list[tuple[float, str]]] = [[] for _ in network.junctions]
         """(time, letters) still to be shown, by junction."""
         self._served = (network.serves.astype(float) @ _turn_groups(network)) > 0
@@ -58,12 +64,18 @@ class Heads:
 
     def patient(self, wish: Ints, view: View) -> Ints:
         """(J,) the wish, but for stages that somebody has waited for too long: these come next, the longest first."""
-        called = self._walked | (self._served @ view.waiting_veh > 0)
-        called[view.stage] = False
-        self._called_s[~called] = view.time_s
-        waited_s = view.time_s - self._called_s
+        if view.time_s >= self._look_s:
+            called = self._walked | (self._served @ view.waiting_veh > 0)
+            called[view.stage] = False
+            self._called_s[~called] = view.time_s
+            waited_s = view.time_s - self._called_s
+            late = np.flatnonzero(waited_s >= MOST_PATIENCE_S)
+            self._overdue = late[np.argsort(waited_s[late], kind="stable")].tolist()
+            self._look_s = view.time_s + LOOK_S
+        if not self._overdue:
+            return wish
         kept = wish.copy()
-        for stage in sorted(np.flatnonzero(waited_s >= MOST_PATIENCE_S), key=lambda stage: waited_s[stage]):
+        for stage in self._overdue:
             kept[self.network.stages[stage].junction] = stage
         return kept
 
