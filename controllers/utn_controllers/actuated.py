@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_sumo.contract import Ints, Junction, Network, Plan, State, View
@@ -72,9 +71,9 @@ class Actuated:
     def wish(self, view: View) -> Ints:
         """(J,) the present stages, but the next one where a green is over."""
         wish = view.stage.copy()
-        now_s, wake_s = view.time_s, self._wake_s
-        for index in np.flatnonzero(view.free).tolist():
-            present = int(wish[index])
+        now_s, stages, wake_s = view.time_s, wish.tolist(), self._wake_s
+        for index in view.free.nonzero()[0].tolist():
+            present = stages[index]
             if present != self._stage[index]:
                 if self._place[present] <= self._place[self._stage[index]]:
                     self._cycle_s[index] = float(view.begin_s[index])

@@ -37,8 +37,10 @@ class Heads:
         """Stages that somebody has waited for too long, the longest last."""
         self._due: list[list[tuple[float, str]]] = [[] for _ in network.junctions]
         """(time, letters) still to be shown, by junction."""
-        self._served = (network.serves.astype(float) @ _turn_groups(network)) > 0
-        """(S, G) lane groups that a stage lets go."""
+        self.next_s = np.inf
+        """When the next letters are due."""
+        self._served = np.sign(network.serves.astype(float) @ _turn_groups(network))
+        """(S, G) 1 where a stage lets a lane group go."""
         self._walked = np.array([_is_walked(network, stage) for stage in network.stages])
         """(S,) stages in which pedestrians go, whom no detector sees."""
 
@@ -48,15 +50,14 @@ class Heads:
         for index, stage in enumerate(self.stage):
             self._show(index, self.network.stages[stage].state)
 
-    def next_s(self) -> float:
-        """When the next letters are due."""
-        return min((due[0][0] for due in self._due if due), default=np.inf)
-
     def advance(self, now_s: float) -> None:
         """Show the letters that are due by now."""
+        if now_s < self.next_s:
+            return
         for index, due in enumerate(self._due):
             while due and due[0][0] <= now_s:
                 self._show(index, due.pop(0)[1])
+        self.next_s = min((due[0][0] for due in self._due if due), default=np.inf)
 
     def free(self, now_s: float) -> Bools:
         """(J,) junctions whose stage has had its least green: they may go on to another."""
@@ -92,6 +93,7 @@ class Heads:
         due.append((at_s, self.network.stages[stage].state))
         self._due[index] = due
         self.stage[index], self.begin_s[index] = stage, at_s
+        self.next_s = min(self.next_s, due[0][0])
         self.advance(now_s)
 
 

@@ -249,11 +249,11 @@ class SumoPlant:
             if free.any():
                 view = Sight(self._eyes, heads, self.time_s, free)
                 wish = heads.patient(self._wish(execution, view), view)
-                for index in np.flatnonzero(free & (wish != heads.stage)):
-                    heads.switch(int(index), int(wish[index]), self.time_s)
+                for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
+                    heads.switch(index, int(wish[index]), self.time_s)
             self._decision_s += execution.every_s
         self.decision_time_s += time.perf_counter() - started
-        return min(self._decision_s, heads.next_s())
+        return min(self._decision_s, heads.next_s)
 
     def _begin(self, execution: Execution, plan: Plan, state: State) -> None:
         started = time.perf_counter()
@@ -267,7 +267,9 @@ class SumoPlant:
         """What the execution wishes; the present stages if it fails to name stages of the junctions."""
         try:
             wish = np.asarray(execution.wish(view))
-            if not np.array_equal(self.network.stage_junction[wish], np.arange(len(self.network.junctions))):
+            if wish.shape != view.stage.shape or any(
+                self.network.stages[wish[index]].junction != index for index in (wish != view.stage).nonzero()[0]
+            ):
                 raise PlanError(f"{wish.tolist()} is no stage for each junction")  # noqa: TRY301 - one way out
         except Exception as error:  # noqa: BLE001 - a foreign execution may raise anything
             self._failed(error)
