@@ -57,7 +57,7 @@ class Actuated:
         self._stage = [junction.stages[0] for junction in network.junctions]
         """Of each junction the stage last seen."""
         self._cycle_s = [0.0] * len(network.junctions)
-        """When its cycle began."""
+        """When its cycle began, and later by what it has rested."""
         self._wake_s = [0.0] * len(network.junctions)
         """Until when nothing can change."""
         self._end_s: list[float] = []
@@ -80,16 +80,19 @@ class Actuated:
                 self._stage[index] = present
             elif now_s < wake_s[index]:
                 continue
-            wish[index], wake_s[index] = self._next(view, present, self._cycle_s[index] + self._end_s[present])
+            wish[index], wake_s[index] = self._next(view, index, present)
         return wish
 
-    def _next(self, view: View, present: int, end_s: float) -> tuple[int, float]:
-        """The stage to show, and until when that can't change."""
+    def _next(self, view: View, index: int, present: int) -> tuple[int, float]:
+        """The stage that a junction is to show, and until when that can't change."""
+        end_s = self._cycle_s[index] + self._end_s[present]
         late = view.time_s >= end_s
         for way in self._ways[present]:
             if way.is_walked or any(view.near_one_veh(group) > 0 for group in (way.serves if late else way.calls)):
                 break
         else:
+            # With nobody elsewhere the cycle's time stands still.
+            self._cycle_s[index] += self.every_s
             return present, 0.0
         if not late:
             for group in way.dry:

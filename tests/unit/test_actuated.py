@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -52,10 +53,7 @@ class Street:
         """(stage, green) of each stage of a junction that has ended."""
         begins = [(time_s, stage) for time_s, junction, stage in self.shown if junction == index]
         clear_s = self.network.clearance_s
-        return [
-            (stage, then_s - time_s - clear_s[stage])
-            for (time_s, stage), (then_s, _) in zip(begins, begins[1:], strict=False)
-        ]
+        return [(stage, then_s - time_s - clear_s[stage]) for (time_s, stage), (then_s, _) in pairwise(begins)]
 
 
 def street(network: Network, plan: Plan | None = None, **settings: float) -> Street:
@@ -132,8 +130,14 @@ def test_a_green_ends_when_the_gap_is_as_long_as_it_is_set(utn17: Network, gap_s
 
 def test_with_nobody_elsewhere_a_green_rests(utn17: Network) -> None:
     road = street(utn17)
-    road.run(400, 0.0, 100.0)
+    road.run(400, 0.0, 0.0)
     assert len(road.shown) == len(utn17.junctions)
+    # Who goes on coming has the rest of their green once somebody is elsewhere, and no more.
+    road.run(60, BUSY, 0.0)
+    plan = utn17.equal_split()
+    for index in range(len(utn17.junctions)):
+        (stage, green_s), *_ = road.greens_s(index)
+        assert 400 < green_s <= 400 + plan.green_s[stage]
 
 
 def test_stages_that_nobody_is_before_are_left_out(utn17: Network) -> None:
