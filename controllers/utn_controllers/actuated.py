@@ -20,8 +20,9 @@ class ActuatedSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    gap_s: float = Field(3.0, gt=0, le=60)
-    """Time without a vehicle at the stop line that ends a green [s]: the gap of SUMO's own actuated signals."""
+    gap_s: float = Field(2.0, gt=0, le=60)
+    """Time without a vehicle at the stop line that ends a green [s]. Of 1.5, 2, 2.5, 3 and 4 the one with least delay
+    on `utn17`; SUMO's own actuated signals have 3 s, but from loops 2 s before the stop line."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,7 @@ class Actuated:
 
     def wish(self, view: View) -> Ints:
         """(J,) the present stages, but the next one where a green is over."""
-        wish = view.stage.copy()
-        now_s, stages, wake_s = view.time_s, wish.tolist(), self._wake_s
+        wish, now_s, stages, wake_s = view.stage, view.time_s, view.stage.tolist(), self._wake_s
         for index in view.free.nonzero()[0].tolist():
             present = stages[index]
             if present != self._stage[index]:
@@ -80,7 +80,11 @@ class Actuated:
                 self._stage[index] = present
             elif now_s < wake_s[index]:
                 continue
-            wish[index], wake_s[index] = self._next(view, index, present)
+            then, wake_s[index] = self._next(view, index, present)
+            if then != present:
+                # Mostly nothing changes, and the present stages themselves say so.
+                wish = wish.copy() if wish is view.stage else wish
+                wish[index] = then
         return wish
 
     def _next(self, view: View, index: int, present: int) -> tuple[int, float]:

@@ -73,7 +73,9 @@ class Eyes:
 
     def _by_group(self, getter: Any) -> Floats:
         """(G,) a count by lane group; who is before the lanes part is shared out as the traffic is."""
-        own = np.bincount(self._area_group, [getter(name) for name in self._areas], self._groups)
+        own = np.bincount(self._area_group, list(map(getter, self._areas)), self._groups)
+        if not self._before:
+            return own.astype(float)
         before = np.bincount(self._before_link, [getter(name) for name in self._before], self._links)
         return np.asarray(own + before[self._group_link] * self._share)
 

@@ -27,6 +27,8 @@ class Heads:
         """(J,) stage that each junction shows, or is on its way to."""
         self.begin_s = np.zeros(len(network.junctions))
         """(J,) when it began, or will."""
+        self._ready_s = self.network.min_green_s[self.stage]
+        """(J,) when it has had its least green."""
         self._ways: dict[tuple[int, int], Phases] = {}
         self._times = [Times.of(network, junction) for junction in network.junctions]
         self._called_s = np.zeros(len(network.stages))
@@ -47,6 +49,7 @@ class Heads:
     def start(self, now_s: float) -> None:
         """Show every junction's first stage."""
         self.begin_s[:] = now_s
+        self._ready_s = now_s + self.network.min_green_s[self.stage]
         for index, stage in enumerate(self.stage):
             self._show(index, self.network.stages[stage].state)
 
@@ -61,7 +64,7 @@ class Heads:
 
     def free(self, now_s: float) -> Bools:
         """(J,) junctions whose stage has had its least green: they may go on to another."""
-        return now_s - self.begin_s >= self.network.min_green_s[self.stage]
+        return np.asarray(now_s >= self._ready_s)
 
     def patient(self, wish: Ints, view: View) -> Ints:
         """(J,) the wish, but for stages that somebody has waited for too long: these come next, the longest first."""
@@ -71,7 +74,7 @@ class Heads:
             self._called_s[~called] = view.time_s
             waited_s = view.time_s - self._called_s
             late = np.flatnonzero(waited_s >= MOST_PATIENCE_S)
-            self._overdue = late[np.argsort(waited_s[late], kind="stable")].tolist()
+            self._overdue = sorted(late.tolist(), key=lambda stage: waited_s[stage])
             self._look_s = view.time_s + LOOK_S
         if not self._overdue:
             return wish
@@ -93,6 +96,7 @@ class Heads:
         due.append((at_s, self.network.stages[stage].state))
         self._due[index] = due
         self.stage[index], self.begin_s[index] = stage, at_s
+        self._ready_s[index] = at_s + self.network.stages[stage].min_green_s
         self.next_s = min(self.next_s, due[0][0])
         self.advance(now_s)
 

@@ -249,8 +249,9 @@ class SumoPlant:
             if free.any():
                 view = Sight(self._eyes, heads, self.time_s, free)
                 wish = heads.patient(self._wish(execution, view), view)
-                for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
-                    heads.switch(index, int(wish[index]), self.time_s)
+                if wish is not view.stage:
+                    for index in np.flatnonzero(free & (wish != heads.stage)).tolist():
+                        heads.switch(index, int(wish[index]), self.time_s)
             self._decision_s += execution.every_s
         self.decision_time_s += time.perf_counter() - started
         return min(self._decision_s, heads.next_s)
@@ -267,6 +268,8 @@ class SumoPlant:
         """What the execution wishes; the present stages if it fails to name stages of the junctions."""
         try:
             wish = np.asarray(execution.wish(view))
+            if wish is view.stage:
+                return wish
             if wish.shape != view.stage.shape or any(
                 self.network.stages[wish[index]].junction != index for index in (wish != view.stage).nonzero()[0]
             ):
