@@ -1,6 +1,7 @@
 """Acyclic rules: whichever stage is worth most now, decided anew every few seconds by what is to be seen before it.
 
-They plan nothing: the plan that goes with them is the equal split, which nobody carries out.
+They are executions that look at no plan, and go with any planner. As controllers they have the equal split beside them,
+which nobody carries out.
 
 max_wave       the stage with most vehicles approaching (RESCO's MAXWAVE)
 max_pressure   the stage with most pressure: vehicles before it less those behind it (Varaiya 2013)
@@ -73,17 +74,14 @@ class WaveSettings(BaseModel):
     """Time between two decisions [s]."""
 
 
-class MaxWave(FixedTime):
+class Wave(Acyclic):
     """Shows the stage with most vehicles approaching, every few seconds anew."""
 
     Settings = WaveSettings
 
     def __init__(self, network: Network, **settings: float):
-        super().__init__(network)
-        self.execution = _Wave(network, WaveSettings(**settings).every_s)
+        super().__init__(network, WaveSettings(**settings).every_s)
 
-
-class _Wave(Acyclic):
     def worth(self, view: View) -> Floats:
         return np.asarray(self.network.serves @ self.by_turn(view.near_veh))
 
@@ -97,23 +95,18 @@ class PressureSettings(WaveSettings):
     """What they are divided by."""
 
 
-class MaxPressure(FixedTime):
+class Pressure(Acyclic):
     """Shows the stage with most pressure, vehicles before it less vehicles behind it, every few seconds anew."""
 
     Settings = PressureSettings
 
     def __init__(self, network: Network, **settings: float | str):
-        super().__init__(network)
-        self.execution = _Pressure(network, PressureSettings(**settings))  # type: ignore[arg-type]
-
-
-class _Pressure(Acyclic):
-    def __init__(self, network: Network, settings: PressureSettings):
-        super().__init__(network, settings.every_s)
-        self._near = settings.count == "near"
+        chosen = PressureSettings(**settings)  # type: ignore[arg-type]
+        super().__init__(network, chosen.every_s)
+        self._near = chosen.count == "near"
         lanes = np.array([len(group.lanes) for group in network.groups], dtype=float)
-        room = {"lane": lanes, "none": np.ones(len(lanes)), "storage": lanes}[settings.per]
-        if settings.per == "storage":
+        room = {"lane": lanes, "none": np.ones(len(lanes)), "storage": lanes}[chosen.per]
+        if chosen.per == "storage":
             by_link = np.bincount(network.group_link, lanes, len(network.links))
             room = network.storage_veh[network.group_link] * lanes / by_link[network.group_link]
         self._room = room
@@ -141,27 +134,21 @@ class PricedSettings(WaveSettings):
     """Share of its storage from which a link is fed no more: beyond it some lane is full and stops the junction."""
 
 
-class Priced(FixedTime):
-    """Shows the stage that gains most: by the vehicles that it can move in a short horizon, at prices of the links."""
+class Prices(Acyclic):
+    """Shows the stage that gains most: by the vehicles that it can move in a short horizon, at prices of the links.
 
-    Settings = PricedSettings
-
-    def __init__(self, network: Network, **settings: float):
-        super().__init__(network)
-        self.execution = _Priced(network, PricedSettings(**settings))
-
-
-class _Priced(Acyclic):
-    """A link costs the more the fuller it is, and what a stage moves gains the difference, as pressure does.
+    A link costs the more the fuller it is, and what a stage moves gains the difference, as pressure does.
 
     Into a full link nothing is gained. A stage is judged by whom it can let through within the horizon, so that among
     queues that all fill it the present stage goes on, which has no clearance to wait for; where few are about, the
     stage with most of them comes next.
     """
 
-    def __init__(self, network: Network, settings: PricedSettings):
-        super().__init__(network, settings.every_s)
-        self.settings = settings
+    Settings = PricedSettings
+
+    def __init__(self, network: Network, **settings: float):
+        self.settings = PricedSettings(**settings)
+        super().__init__(network, self.settings.every_s)
         self._fed = network.turn_next != EXIT
         self._next = np.maximum(network.turn_next, 0)
         self._stage, self._turn = np.nonzero(network.serves)
@@ -184,3 +171,33 @@ class _Priced(Acyclic):
 
 TIE_SHARE = 1e-3
 """What vehicles beyond the horizon count: who is equal within it is told apart by the longer queue."""
+
+
+class MaxWave(FixedTime):
+    """Shows the stage with most vehicles approaching, every few seconds anew."""
+
+    Settings = WaveSettings
+
+    def __init__(self, network: Network, **settings: float):
+        super().__init__(network)
+        self.execution = Wave(network, **settings)
+
+
+class MaxPressure(FixedTime):
+    """Shows the stage with most pressure, vehicles before it less vehicles behind it, every few seconds anew."""
+
+    Settings = PressureSettings
+
+    def __init__(self, network: Network, **settings: float | str):
+        super().__init__(network)
+        self.execution = Pressure(network, **settings)
+
+
+class Priced(FixedTime):
+    """Shows the stage that gains most: by the vehicles that it can move in a short horizon, at prices of the links."""
+
+    Settings = PricedSettings
+
+    def __init__(self, network: Network, **settings: float):
+        super().__init__(network)
+        self.execution = Prices(network, **settings)

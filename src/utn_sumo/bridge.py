@@ -30,6 +30,7 @@ from utn_sumo import (
 from utn_sumo.case import SUFFIX, Case
 from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
+from utn_sumo.errors import SettingError
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.sumo import SumoPlant
 from utn_sumo.plant.untouched import Look
@@ -59,12 +60,14 @@ def run(
     A KeyboardInterrupt ends the run early with a whole, readable result that says so. Raises UtnError.
     """
     if alone := sumo_signals.RUNS.get(scenario.controller):
+        _refuse_execution(scenario)
         return alone(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
     chosen = traffic.given(scenario) if scenario.net.endswith(SUFFIX) else None
     net = streets.named(scenario.net) if chosen is None else streets.controllable(chosen)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
-    controller = controllers.build(scenario.controller, known, scenario.settings)
+    controller = controllers.build(scenario.controller, known, scenario.controller_settings)
+    carried_out, execution = controllers.build_execution(scenario, known, controller)
     step_s, duration_s = net.control_step_s, scenario.duration_s
     if chosen is not None and chosen.end_s is not None:
         duration_s = chosen.end_s - chosen.begin_s
@@ -85,19 +88,11 @@ def run(
     with (
         threadpool_limits(1),
         predictor,
-        SumoPlant(
-            net,
-            driving,
-            folder,
-            seed=scenario.seed,
-            duration_s=duration_s,
-            execution=getattr(controller, "execution", None),
-        ) as plant,
+        SumoPlant(net, driving, folder, seed=scenario.seed, duration_s=duration_s, execution=execution) as plant,
     ):
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
-        recorder = recording.Recorder(folder, _settings(scenario, driving, plant.version))
-        state = estimator.initial()
+        recorder, state = recording.Recorder(folder, _settings(scenario, driving, plant.version)), estimator.initial()
         try:
             for step in range(steps):
                 ahead = predictor.forecast(controller.horizon)
@@ -126,12 +121,13 @@ def run(
             interrupted = True
         finally:
             recorder.close()
-    in_order = getattr(controller, "execution", None) is None
-    verdict = monitor.watch(net, folder / "signals.xml", plant.time_s, plant.begin_s, in_order=in_order)
+    verdict = monitor.watch(net, folder / "signals.xml", plant.time_s, plant.begin_s, in_order=execution is None)
+    greens = metrics.Greens(net, folder / "signals.xml", plant.time_s, plant.begin_s)
     trips = metrics.trip_measures(folder / "trips.xml")
     elapsed_s = time.perf_counter() - started
     result = {
         "controller": scenario.controller,
+        "execution": carried_out,
         "net": scenario.net,
         "demand": scenario.demand,
         "seed": scenario.seed,
@@ -141,16 +137,17 @@ def run(
         "max_vehicles_veh": tally.max_vehicles_veh,
         "over_storage_veh": tally.over_storage_veh(net.storage_veh),
         "teleports": metrics.teleports(folder / "statistics.xml"),
-        "gridlock": metrics.gridlocked(net, tally.x_veh, tally.left_veh, tally.green_s),
+        "gridlock": metrics.gridlocked(net, tally.x_veh, tally.left_veh, greens.by_turn_s(tally.ends_s)),
+        "longest_red_s": greens.longest_wait_s(plant.waiting),
         "unsafe_signal_s": verdict.unsafe_signal_s,
-        "fallbacks": tally.fallbacks,
+        "fallbacks": tally.fallbacks + len(plant.failures),
         "sumo_time_s": plant.sumo_time_s,
         "control_time_s": tally.control_time_s + plant.decision_time_s,
-        "bridge_time_s": elapsed_s - (plant.sumo_time_s - start_s) - tally.control_time_s,
+        "bridge_time_s": elapsed_s - (plant.sumo_time_s - start_s) - tally.control_time_s - plant.decision_time_s,
         "interrupted": interrupted,
         "left_alone": dict(net.left_alone),
         "unsafe_reasons": verdict.reasons[:20],
-        "fallback_reasons": tally.fallback_reasons[:20],
+        "fallback_reasons": [*tally.fallback_reasons, *plant.failures][:20],
         "out": str(folder),
     }
     recording.write_json(folder / recording.RESULT, result)
@@ -179,6 +176,15 @@ def _predictor(net: Network, scenario: Scenario, driving: Path | Case, steps: in
     )
 
 
+def _refuse_execution(scenario: Scenario) -> None:
+    """Raise SettingError for an execution beside signals that SUMO switches itself."""
+    if scenario.execution is not None:
+        raise SettingError(
+            f"setting 'execution' is {scenario.execution!r}: controller {scenario.controller!r} plans nothing that "
+            "could be carried out, SUMO switches its signals: leave it out"
+        )
+
+
 class _Tally:
     """What the run adds up as it goes."""
 
@@ -189,7 +195,7 @@ class _Tally:
         self.fallback_reasons: list[str] = []
         self.x_veh: list[Floats] = []
         self.left_veh: list[Floats] = []
-        self.green_s: list[Floats] = []
+        self.ends_s: list[float] = []
         self._max_x_veh: list[Floats] = []
         self._max_queue_veh: list[Floats] = []
 
@@ -203,7 +209,7 @@ class _Tally:
         self.time_spent_veh_h += truth.time_spent_veh_h
         self.x_veh.append(truth.x_veh)
         self.left_veh.append(left_veh)
-        self.green_s.append(decision.plan.green_s)
+        self.ends_s.append(plant.time_s)
         self._max_x_veh.append(truth.max_x_veh)
         self._max_queue_veh.append(truth.max_queue_veh)
 
@@ -228,6 +234,8 @@ def _default_name(scenario: Scenario) -> str:
     net, controller = (
         Path(part.partition(":")[0]).name.partition(".")[0] for part in (scenario.net, scenario.controller)
     )
+    if scenario.execution is not None:
+        controller += f"-{Path(scenario.execution.partition(':')[0]).name.partition('.')[0]}"
     return f"{net}-{controller}-demand{scenario.demand:g}-seed{scenario.seed}"
 
 

@@ -26,6 +26,7 @@ def cli() -> None:
 @click.argument("case", required=False)
 @click.option("--net", help="Shipped network, or a .net.xml file.  [utn17]")
 @click.option("--controller", help="Registered controller, path.py:Class, or native: the net's own.  [dmpc]")
+@click.option("--execution", help="How plans are carried out: exact, registered, path.py:Class.  [the controller's]")
 @click.option("--hours", help="Simulated hours.  [4]")
 @click.option("--demand", help="Scale of the demand profile.  [1.0]")
 @click.option("--profile", help="Demand profile: peak, paper or constant.  [peak]")
@@ -39,7 +40,9 @@ def cli() -> None:
 @click.option("--horizon", help="Prediction horizon Kp of a predictive controller, in cycles.  [7]")
 @click.option("--control-horizon", help="Control horizon Kc, in cycles.  [4]")
 @click.option("--cost", help="Cost of a predictive controller: tts or paper.  [tts]")
-@click.option("--set", "pairs", multiple=True, metavar="NAME=VALUE", help="Any other setting of the controller.")
+@click.option(
+    "--set", "pairs", multiple=True, metavar="NAME=VALUE", help="Any other setting; execution.NAME of the execution."
+)
 @click.option("--scenario", "file", type=click.Path(path_type=Path), help="TOML file with these settings.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
 @click.option("--json", "as_json", is_flag=True, help="Print the measures as one JSON object, and nothing else.")
@@ -51,13 +54,20 @@ def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bo
     from utn_sumo import bridge, report  # noqa: PLC0415 - heavy
     from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy
 
-    settings = {name: flags.pop(name) for name in ("horizon", "control_horizon", "cost")}
-    settings = {name: _number(value) for name, value in settings.items() if value is not None}
+    named = {name: flags.pop(name) for name in ("horizon", "control_horizon", "cost")}
+    settings: dict[str, Any] = {name: _number(value) for name, value in named.items() if value is not None}
+    of_execution: dict[str, Any] = {}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals:
             raise SettingError(f"--set {pair!r}: write it as NAME=VALUE")
-        settings[name.strip()] = _number(value.strip())
+        owner, dot, rest = name.strip().partition(".")
+        if dot and owner == "execution":
+            of_execution[rest] = _number(value.strip())
+        else:
+            settings[name.strip()] = _number(value.strip())
+    if of_execution:
+        settings["execution"] = of_execution
     own = flags.pop("case")
     if own is not None and flags["net"] is not None:
         raise SettingError(f"setting 'net' is {flags['net']!r}, beside {own!r}: give one of them")
@@ -260,15 +270,18 @@ def replay(folder: Path) -> None:
 
 @cli.command()
 def controllers() -> None:
-    """List the registered controllers and their settings."""
-    from utn_sumo.controllers import registered, settings_of  # noqa: PLC0415 - heavy
+    """List the registered controllers and executions, and their settings."""
+    from utn_sumo.controllers import CONTROLLER, EXECUTION, registered, settings_of  # noqa: PLC0415 - heavy
 
-    for name, point in registered().items():
-        factory = point.load()
-        click.echo(f"{name}: {(factory.__doc__ or '').strip().splitlines()[0]}")
-        names = settings_of(factory)
-        click.echo(f"    settings: {', '.join(names) if names else 'none'}")
-    click.echo("native: The net's own signal programmes, untouched.")
+    for kind in (CONTROLLER, EXECUTION):
+        click.echo(f"{kind.noun}s")
+        for name, point in registered(kind).items():
+            factory = point.load()
+            click.echo(f"  {name}: {(factory.__doc__ or '').strip().splitlines()[0]}")
+            names = settings_of(factory)
+            click.echo(f"      settings: {', '.join(names) if names else 'none'}")
+        for name, told in kind.others.items():
+            click.echo(f"  {name}: {told}")
 
 
 @cli.group()

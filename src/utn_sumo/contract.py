@@ -540,29 +540,60 @@ class Plan:
     """What the controller wants recorded: iterations, residuals, cost."""
 
 
-@dataclass(frozen=True)
-class View:
-    """What is to be seen at one moment, for decisions within the cycle."""
+class View(Protocol):
+    """What is to be seen at one moment, for decisions within the cycle. Detectors are read when they are asked for."""
 
-    time_s: float
-    stage: Ints
-    """(J,) stage that each junction shows, or is on its way to."""
-    free: Bools
-    """(J,) junctions whose stage has had its least green."""
-    waiting_veh: Floats
-    """(G,) standing in the lane-area detectors, by lane group."""
-    near_veh: Floats
-    """(G,) in the lane-area detectors, moving or not, by lane group."""
-    x_veh: Floats
-    """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
+    @property
+    def time_s(self) -> float: ...
+
+    @property
+    def stage(self) -> Ints:
+        """(J,) stage that each junction shows, or is on its way to."""
+        ...
+
+    @property
+    def begin_s(self) -> Floats:
+        """(J,) when it began, or will."""
+        ...
+
+    @property
+    def free(self) -> Bools:
+        """(J,) junctions whose stage has had its least green."""
+        ...
+
+    @property
+    def waiting_veh(self) -> Floats:
+        """(G,) standing in the lane-area detectors, by lane group."""
+        ...
+
+    @property
+    def near_veh(self) -> Floats:
+        """(G,) in the lane-area detectors, moving or not, by lane group."""
+        ...
+
+    @property
+    def x_veh(self) -> Floats:
+        """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
+        ...
+
+    def near_one_veh(self, group: int) -> float:
+        """What `near_veh` has for one lane group, for whom the others are no matter."""
+        ...
+
+    def gap_one_s(self, group: int) -> float:
+        """Time since a vehicle was last on the stop-line loops of one lane group."""
+        ...
 
 
 @runtime_checkable
 class Execution(Protocol):
-    """Whatever carries a plan out within the cycle, by what is to be seen at the moment."""
+    """Whatever carries a plan out within the cycle, by what is to be seen at the moment.
+
+    An execution is built as `Class(network, **settings)`.
+    """
 
     every_s: float
-    """Time between two decisions."""
+    """Time between two decisions: a second or more."""
 
     def begin(self, plan: Plan, state: State) -> None:
         """Take up the plan of a new control step, and the state that it was made from."""

@@ -1,43 +1,103 @@
-"""Controllers by name: entry points of the group `utn_sumo.controllers`, ours and users' alike, or `path.py:Class`."""
+"""Controllers and executions by name: entry points of the groups `utn_sumo.controllers` and `utn_sumo.executions`, ours
+and users' alike, or `path.py:Class`.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from utn_sumo.contract import Controller, Network
+from utn_sumo.contract import Controller, Execution, Network
 from utn_sumo.errors import ControllerError, SettingError, UtnError, did_you_mean
-from utn_sumo.scenario import explain
+from utn_sumo.scenario import EXACT, Scenario, explain
 
-GROUP = "utn_sumo.controllers"
 T = TypeVar("T")
 
 
-def registered() -> dict[str, EntryPoint]:
+@dataclass(frozen=True)
+class Kind:
+    """A kind of thing that is found by name."""
+
+    noun: str
+    contract: Any
+    """Protocol that it has to follow."""
+    needs: str
+    others: Mapping[str, str]
+    """What there is beside the registered ones, and what it does."""
+
+    @property
+    def group(self) -> str:
+        """Its entry-point group."""
+        return f"utn_sumo.{self.noun}s"
+
+
+CONTROLLER = Kind(
+    "controller",
+    Controller,
+    "`horizon` or `plan(state, forecast)`",
+    {"native": "The net's own signal programmes, untouched."},
+)
+EXECUTION = Kind(
+    "execution",
+    Execution,
+    "`every_s`, `begin(plan, state)` or `wish(view)`",
+    {EXACT: "The plan's greens, to the second."},
+)
+
+
+def registered(kind: Kind = CONTROLLER) -> dict[str, EntryPoint]:
     """Entry points by name."""
-    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+    return {point.name: point for point in sorted(entry_points(group=kind.group), key=lambda point: point.name)}
 
 
 def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
     """The controller called `name`, built for `network`. Raises ControllerError or SettingError."""
-    factory = _from_file(name) if ".py:" in name else _registered(name)
+    found: Controller = _built(CONTROLLER, name, network, settings)
+    return found
+
+
+def build_execution(scenario: Scenario, network: Network, controller: Controller) -> tuple[str, Execution | None]:
+    """What carries out a scenario's plans, and its name; the controller's own execution if the scenario names none.
+
+    None shows a plan's greens to the second. Raises ControllerError or SettingError.
+    """
+    settings, name = scenario.execution_settings, scenario.execution
+    if name is None:
+        own = getattr(controller, "execution", None)
+        return (EXACT, None) if own is None else (_name_of(own), own)
+    if name == EXACT:
+        return name, None
+    found: Execution = _built(EXECUTION, name, network, settings)
+    if not found.every_s >= 1:
+        raise ControllerError(f"execution {name!r} decides every {found.every_s!r} s: make `every_s` 1 or more")
+    return name, found
+
+
+def _name_of(execution: Execution) -> str:
+    """The name that its class is registered under, else the class's own."""
+    path = f"{type(execution).__module__}:{type(execution).__qualname__}"
+    names = (name for name, point in registered(EXECUTION).items() if point.value == path)
+    return next(names, type(execution).__qualname__)
+
+
+def _built(kind: Kind, name: str, network: Network, settings: dict[str, Any]) -> Any:
+    factory = _from_file(kind, name) if ".py:" in name else _registered(kind, name)
     if not callable(factory):
-        raise ControllerError(f"controller {name!r} is {factory!r}: name a class")
-    controller = made(name, factory, settings, network)
-    if not isinstance(controller, Controller):
-        raise ControllerError(
-            f"controller {name!r} lacks `horizon` or `plan(state, forecast)`: see contract.Controller"
-        )
-    return controller
+        raise ControllerError(f"{kind.noun} {name!r} is {factory!r}: name a class")
+    found = made(name, factory, settings, network, noun=kind.noun)
+    if not isinstance(found, kind.contract):
+        raise ControllerError(f"{kind.noun} {name!r} lacks {kind.needs}: see contract.{kind.noun.capitalize()}")
+    return found
 
 
-def made(name: str, factory: Callable[..., T], settings: dict[str, Any], *given: Any) -> T:
+def made(name: str, factory: Callable[..., T], settings: dict[str, Any], *given: Any, noun: str = CONTROLLER.noun) -> T:
     """What the factory of controller `name` makes of its settings, after what else it is given.
 
     Raises ControllerError or SettingError.
@@ -46,44 +106,45 @@ def made(name: str, factory: Callable[..., T], settings: dict[str, Any], *given:
     for word in settings:
         if word not in takes:
             rest = did_you_mean(word, takes) if takes else "it takes none"
-            raise SettingError(f"controller {name!r} has no setting {word!r}: {rest}")
+            raise SettingError(f"{noun} {name!r} has no setting {word!r}: {rest}")
     try:
         return factory(*given, **settings)
     except ValidationError as error:
-        raise SettingError(f"controller {name!r}: {explain(error, takes)}") from error
+        raise SettingError(f"{noun} {name!r}: {explain(error, takes)}") from error
     except UtnError:
         raise
     except Exception as error:
-        raise ControllerError(f"controller {name!r} can't be built: {_told(error)}") from error
+        raise ControllerError(f"{noun} {name!r} can't be built: {_told(error)}") from error
 
 
 def settings_of(factory: Any) -> list[str]:
-    """Names of the settings that a controller class takes: its `Settings` model's fields, else its arguments."""
+    """Names of the settings that a class takes: its `Settings` model's fields, else its arguments."""
     model = getattr(factory, "Settings", None)
     if model is not None:
         return list(model.model_fields)
     return [word for word in inspect.signature(factory).parameters if word != "network"]
 
 
-def _registered(name: str) -> Any:
-    points = registered()
+def _registered(kind: Kind, name: str) -> Any:
+    points = registered(kind)
     if name not in points:
-        raise ControllerError(f"controller {name!r} is unknown: {did_you_mean(name, points)}, or path.py:Class")
+        known = did_you_mean(name, [*points, *kind.others])
+        raise ControllerError(f"{kind.noun} {name!r} is unknown: {known}, or path.py:Class")
     return points[name].load()
 
 
-def _from_file(name: str) -> Any:
+def _from_file(kind: Kind, name: str) -> Any:
     path, _, attribute = name.rpartition(":")
     spec = importlib.util.spec_from_file_location(Path(path).stem, path)
     if spec is None or spec.loader is None or not Path(path).is_file():
-        raise ControllerError(f"controller {name!r}: there is no file {path!r}")
+        raise ControllerError(f"{kind.noun} {name!r}: there is no file {path!r}")
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise ControllerError(f"controller {name!r}: {path!r} can't be loaded: {_told(error)}") from error
+        raise ControllerError(f"{kind.noun} {name!r}: {path!r} can't be loaded: {_told(error)}") from error
     if not hasattr(module, attribute):
-        raise ControllerError(f"controller {name!r}: {path!r} has no class {attribute!r}")
+        raise ControllerError(f"{kind.noun} {name!r}: {path!r} has no class {attribute!r}")
     return getattr(module, attribute)
 
 

@@ -16,7 +16,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from utn_sumo.contract import Floats, Link, Measurement, Network
+from utn_sumo.contract import Floats, LaneGroup, Link, Measurement, Network
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -40,6 +40,8 @@ class DetectorIds:
     area: tuple[tuple[str, ...], ...]
     group: tuple[tuple[str, ...], ...]
     """(G,) of the lane-area detectors those on a lane group."""
+    group_stop_line: tuple[tuple[str, ...], ...]
+    """(G,) of the loops at the stop line those on a lane group."""
     upstream: tuple[tuple[str, ...], ...]
     """(Z,) of the lane-area detectors those before the lane groups part."""
     joining: tuple[tuple[str, ...], ...]
@@ -52,6 +54,9 @@ def ids(network: Network) -> DetectorIds:
     def on(kind: str, edge: str) -> tuple[str, ...]:
         return tuple(_named(kind, f"{edge}_{lane}") for lane in network.edge_lanes[edge])
 
+    def of_group(kind: str, group: LaneGroup) -> tuple[str, ...]:
+        return tuple(_named(kind, f"{network.links[group.link].edges[-1]}_{lane}") for lane in group.lanes)
+
     return DetectorIds(
         entry=tuple(on("entry", link.edges[0]) for link in network.links),
         stop_line=tuple(on("stop", link.edges[-1]) for link in network.links),
@@ -59,10 +64,8 @@ def ids(network: Network) -> DetectorIds:
         area=tuple(
             tuple(name for edge, _ in _watched(network, link) for name in on("area", edge)) for link in network.links
         ),
-        group=tuple(
-            tuple(_named("area", f"{network.links[group.link].edges[-1]}_{lane}") for lane in group.lanes)
-            for group in network.groups
-        ),
+        group=tuple(of_group("area", group) for group in network.groups),
+        group_stop_line=tuple(of_group("stop", group) for group in network.groups),
         upstream=tuple(
             tuple(name for edge, _ in _watched(network, link) if edge != link.edges[-1] for name in on("area", edge))
             for link in network.links

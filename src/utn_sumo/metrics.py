@@ -9,7 +9,8 @@ from xml.etree import ElementTree as ET  # only for the files that our own SUMO 
 
 import numpy as np
 
-from utn_sumo.contract import Floats, Network
+from utn_sumo import monitor
+from utn_sumo.contract import Bools, Floats, Network
 from utn_sumo.errors import ResultError
 
 
@@ -62,19 +63,90 @@ GRIDLOCK_OCCUPANCY = 0.5
 GRIDLOCK_DISCHARGE = 0.1
 
 
-def gridlocked(network: Network, x_veh: Sequence[Floats], left_veh: Sequence[Floats], greens: Sequence[Floats]) -> bool:
+def gridlocked(network: Network, x_veh: Sequence[Floats], left_veh: Sequence[Floats], green_s: Floats) -> bool:
     """Whether some link stood still: for three control steps on end it was at least half full at both ends of the
     step and discharged under a tenth of what its green allows.
 
-    `x_veh` (steps, Z) at the end of each step, `left_veh` (steps, Z), `greens` (steps, S).
+    `x_veh` (steps, Z) at the end of each step, `left_veh` (steps, Z), `green_s` (steps, M) of each turn.
     """
     if len(x_veh) <= GRIDLOCK_STEPS:
         return False
-    x, left, green = (np.asarray(series, dtype=float) for series in (x_veh, left_veh, greens))
+    x, left = (np.asarray(series, dtype=float) for series in (x_veh, left_veh))
     first_turn = np.searchsorted(network.turn_link, np.arange(x.shape[1]))
-    link_green = np.maximum.reduceat(green @ network.serves, first_turn, axis=1)
+    link_green = np.maximum.reduceat(green_s, first_turn, axis=1)
     full = x >= GRIDLOCK_OCCUPANCY * network.storage_veh
     stuck = left <= GRIDLOCK_DISCHARGE * link_green * network.saturation_flow_veh_s
     still = full[:-1] & full[1:] & stuck[1:]
     windows = np.lib.stride_tricks.sliding_window_view(still, GRIDLOCK_STEPS, axis=0)
     return bool(windows.all(axis=-1).any())
+
+
+class Greens:
+    """When turns and lane groups had green, by SUMO's own record of the signals."""
+
+    def __init__(self, network: Network, switches: Path, duration_s: float, begin_s: float = 0.0):
+        """Of a run of `duration_s` that began at SUMO's time `begin_s`. Raises ResultError."""
+        shown = monitor.read_switches(switches)
+        self._turns = len(network.turns)
+        self._groups = len(network.groups)
+        self._spans: dict[int, tuple[Floats, Floats]] = {}
+        """Of each turn with signals when its greens began and ended."""
+        self._reds: dict[int, tuple[Floats, Floats]] = {}
+        """Of each lane group with signals alone the same of its reds."""
+        unsignalled = set(network.turn_group[network.unsignalled].tolist())
+        for index, junction in enumerate(network.junctions):
+            switched = shown.get(junction.id, [])
+            times = np.array([second - begin_s for second, _ in switched] + [duration_s], dtype=float)
+            letters = np.array([[letter in monitor.GREEN for letter in state] for _, state in switched], dtype=bool)
+            if not len(letters):
+                continue
+            by_turn: dict[int, list[int]] = {}
+            for signal, turns in enumerate(junction.signal_turns):
+                for turn in turns:
+                    by_turn.setdefault(turn, []).append(signal)
+            by_group: dict[int, list[int]] = {}
+            for turn, signals in by_turn.items():
+                self._spans[turn] = _spans(np.any(letters[:, signals], axis=1), times)
+                by_group.setdefault(int(network.turn_group[turn]), []).extend(signals)
+            for group in set(network.groups_of[index].tolist()) & by_group.keys() - unsignalled:
+                self._reds[group] = _spans(~np.any(letters[:, by_group[group]], axis=1), times)
+
+    def by_turn_s(self, ends_s: Sequence[float]) -> Floats:
+        """(steps, M) green of each turn in each control step, of which `ends_s` are the ends; without signals all."""
+        edges_s = np.array([0.0, *ends_s])
+        green_s = np.repeat(np.diff(edges_s)[:, None], self._turns, axis=1)
+        for turn, (begin_s, end_s) in self._spans.items():
+            lit_s = np.clip(edges_s[:, None], begin_s, end_s) - begin_s
+            green_s[:, turn] = np.diff(lit_s.sum(axis=1))
+        return green_s
+
+    def longest_wait_s(self, waiting: Sequence[tuple[float, Bools]]) -> float:
+        """Longest that somebody stood before a lane group's red, on end, without green meanwhile.
+
+        `waiting` has (time, whether anybody stands (G,)) at each look: who stood between two looks is not known.
+        """
+        if not waiting:
+            return 0.0
+        times = np.array([time_s for time_s, _ in waiting])
+        stands = np.array([each for _, each in waiting])
+        longest_s = 0.0
+        for group, (begin_s, end_s) in self._reds.items():
+            nobody = np.where(stands[:, group], -1, np.arange(len(times)))
+            since_s = times[np.minimum(np.maximum.accumulate(nobody) + 1, len(times) - 1)]
+            # A wait is over at the last look that saw it, or at the red's end if that comes before another look.
+            seen = np.flatnonzero(stands[:, group])
+            red = np.searchsorted(begin_s, times[seen], side="right") - 1
+            seen, red = seen[red >= 0], red[red >= 0]
+            if not len(seen):
+                continue
+            until_s = np.append(times, np.inf)[seen + 1]
+            ended_s = np.where(end_s[red] < until_s, end_s[red], times[seen])
+            wait_s = ended_s - np.maximum(begin_s[red], since_s[seen])
+            longest_s = max(longest_s, float(wait_s.max()))
+        return longest_s
+
+
+def _spans(lit: Bools, times: Floats) -> tuple[Floats, Floats]:
+    """Begins and ends of the stretches in which `lit` (n,) holds, which changes at `times` (n + 1,)."""
+    edges = np.diff(np.concatenate([[False], lit, [False]]).astype(int))
+    return times[np.flatnonzero(edges == 1)], times[np.flatnonzero(edges == -1)]

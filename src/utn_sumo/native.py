@@ -81,6 +81,7 @@ def measured(
     verdict = judged and monitor.watch(judged, folder / "signals.xml", outcome.end_s - chosen.begin_s, chosen.begin_s)
     result = {
         "controller": scenario.controller,
+        "execution": None,
         "net": scenario.net,
         "demand": scenario.demand,
         "seed": scenario.seed,
@@ -91,6 +92,7 @@ def measured(
         "over_storage_veh": None,
         "teleports": metrics.teleports(folder / "statistics.xml"),
         "gridlock": None,
+        "longest_red_s": None,
         "unsafe_signal_s": verdict and verdict.unsafe_signal_s,
         "fallbacks": 0,
         "sumo_time_s": outcome.sumo_time_s,

@@ -33,6 +33,7 @@ ROWS = [
     ("stops", "stops", "", "{:d}"),
     ("teleports", "teleports", "", "{:d}"),
     ("gridlock", "gridlock", "", "{}"),
+    ("longest_red_s", "longest wait before a red", "s", "{:.0f}"),
     ("unsafe_signal_s", "unsafe signals", "s", "{:d}"),
     ("fallbacks", "fallbacks", "cycles", "{:d}"),
     ("sumo_time_s", "time in SUMO", "s", "{:.2f}"),

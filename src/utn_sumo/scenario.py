@@ -11,6 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from utn_sumo.errors import SettingError, did_you_mean
 
+EXACT = "exact"
+"""The execution that shows a plan's greens to the second."""
+
 
 class Scenario(BaseModel):
     """Settings of one run; each is checked here, once."""
@@ -21,8 +24,10 @@ class Scenario(BaseModel):
     """A shipped network's name, or the path of a .net.xml."""
     controller: str = "dmpc"
     """A registered controller's name, or `path.py:Class`."""
+    execution: str | None = None
+    """How its plans are carried out: `exact`, a registered execution's name, or `path.py:Class`; else its own way."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """The controller's own settings."""
+    """The controller's own settings; under `execution` those of the execution."""
     hours: float = Field(4.0, gt=0, le=240)
     demand: float = Field(1.0, ge=0, le=10)
     """Scales the demand profile."""
@@ -50,6 +55,22 @@ class Scenario(BaseModel):
         return hours
 
     @property
+    def controller_settings(self) -> dict[str, Any]:
+        """The settings that are the controller's."""
+        return {name: value for name, value in self.settings.items() if name != "execution"}
+
+    @property
+    def execution_settings(self) -> dict[str, Any]:
+        """The settings that are the execution's. Raises SettingError if they are no table, or nobody's."""
+        table = self.settings.get("execution", {})
+        if not isinstance(table, dict):
+            raise SettingError(f"setting 'execution' in 'settings' is {table!r}: it must be a table of settings")
+        if table and self.execution in {None, EXACT}:
+            name, value = next(iter(table.items()))
+            raise SettingError(f"setting 'execution.{name}' is {value!r}: name the execution that takes it")
+        return table
+
+    @property
     def duration_s(self) -> float:
         return round(self.hours * 3600)
 
@@ -68,7 +89,10 @@ def scenario(file: Path | None = None, **given: Any) -> Scenario:
     table = values.get("settings", {})
     if not isinstance(table, dict):
         raise SettingError(f"setting 'settings' is {table!r}: it must be a table of the controller's settings")
-    settings = {**table, **given.pop("settings", {})}
+    own = given.pop("settings", {})
+    settings = {**table, **own}
+    if isinstance(table.get("execution"), dict) and isinstance(own.get("execution"), dict):
+        settings["execution"] = {**table["execution"], **own["execution"]}
     try:
         return Scenario(**{**values, **given, "settings": settings})
     except ValidationError as error:

@@ -48,6 +48,23 @@ MISTAKES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "unknown setting": (("run", "--set", "iteration=3"), "'iteration'", "did you mean 'iterations'"),
     "setting without a bound": (("run", "--hours", "0.1", "--set", "rho=Infinity"), "'rho' is inf", "must be"),
     "setting of a controller that has none": (("run", "--controller", "fixed", "--horizon", "3"), "'horizon'", "none"),
+    "unknown execution": (("run", "--execution", "actuatd"), "'actuatd'", "did you mean 'actuated'? known: "),
+    "setting of no execution": (("run", "--set", "execution.gap_s=2"), "'execution.gap_s'", "name the execution"),
+    "setting that an execution lacks": (
+        ("run", "--execution", "actuated", "--set", "execution.gap=2"),
+        "'gap'",
+        "did you mean 'gap_s'",
+    ),
+    "setting of an execution out of range": (
+        ("run", "--execution", "actuated", "--set", "execution.gap_s=0"),
+        "'gap_s' is 0",
+        "must be greater than 0",
+    ),
+    "execution beside SUMO's own signals": (
+        ("run", "--controller", "delay_based", "--execution", "exact"),
+        "'execution' is 'exact'",
+        "leave it out",
+    ),
     "unknown flag": (("run", "--horizn", "3"), "'--horizn'", "--horizon"),
     "unknown command": (("rum",), "'rum'", "Did you mean 'run'"),
     "missing scenario file": (("run", "--scenario", "none.toml"), "'none.toml'", "name"),
@@ -149,7 +166,7 @@ def test_a_scenario_file_says_what_flags_say_and_flags_win(utn: Utn, folder: Pat
         (("replay", "--help"), ["FOLDER"]),
         (("net", "--help"), ["build", "check"]),
         (("--version",), ["utn"]),
-        (("controllers",), ["fixed", "dmpc", "horizon", "settings: none"]),
+        (("controllers",), ["fixed", "dmpc", "horizon", "settings: none", "executions", "exact", "gap_s"]),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )

@@ -8,9 +8,10 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from tests.unit.views import scene
 from utn_sumo import clearances, monitor
 from utn_sumo.clearances import Times, between
-from utn_sumo.contract import Junction, Network, View
+from utn_sumo.contract import Junction, Network
 from utn_sumo.plant.heads import MOST_PATIENCE_S, Heads
 
 
@@ -74,24 +75,12 @@ def test_the_monitor_has_nothing_to_say_against_any_order_of_stages(utn17: Netwo
     assert len(changes) > 100
 
 
-def view(network: Network, time_s: float, stage: int, waiting: float) -> View:
-    nobody = np.zeros(len(network.groups))
-    return View(
-        time_s=time_s,
-        stage=np.array([junction.stages[stage] for junction in network.junctions]),
-        free=np.ones(len(network.junctions), dtype=bool),
-        waiting_veh=nobody + waiting,
-        near_veh=nobody + waiting,
-        x_veh=np.zeros(len(network.links)),
-    )
-
-
 def test_who_waits_too_long_comes_next_and_who_does_not_wait_does_not(utn17: Network) -> None:
     heads = Heads(utn17, lambda index, state: None)
     for waiting, forced in ((1.0, True), (0.0, False)):
         heads = Heads(utn17, lambda index, state: None)
         for time_s in np.arange(0, MOST_PATIENCE_S + 5, 5):
-            now = view(utn17, float(time_s), 0, waiting)
+            now = scene(utn17, float(time_s), veh=waiting)
             kept = heads.patient(now.stage, now)
             if time_s < MOST_PATIENCE_S - 1:
                 assert (kept == now.stage).all()

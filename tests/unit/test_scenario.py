@@ -122,3 +122,16 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, content: bytes, word:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     assert "none.toml" in complaint(tmp_path / "none.toml")
     assert str(tmp_path) in complaint(tmp_path)
+
+
+def test_an_executions_settings_are_a_table_in_the_settings_and_flags_win(tmp_path: Path) -> None:
+    file = tmp_path / "scenario.toml"
+    file.write_text(
+        'execution = "actuated"\n[settings]\nhorizon = 5\n[settings.execution]\ngap_s = 2\nother = 1\n',
+        encoding="utf-8",
+    )
+    chosen = scenario(file, settings={"execution": {"gap_s": 4}, "cost": "paper"})
+    assert chosen.execution == "actuated"
+    assert chosen.execution_settings == {"gap_s": 4, "other": 1}
+    assert chosen.controller_settings == {"horizon": 5, "cost": "paper"}
+    assert scenario(file).execution_settings == {"gap_s": 2, "other": 1}

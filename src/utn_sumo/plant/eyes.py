@@ -1,22 +1,24 @@
-"""What the detectors show at one moment, read all at once."""
+"""What the detectors show at one moment, each read when somebody asks for it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
 import numpy as np
 
-from utn_sumo.contract import Bools, Floats, Ints, Network, View
+from utn_sumo.contract import Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.heads import Heads
 
 
 class Eyes:
-    """Reads the lane-area detectors and the counting loops of a network."""
+    """Reads the lane-area detectors and the loops of a network."""
 
-    def __init__(self, network: Network, ids: DetectorIds):
+    def __init__(self, network: Network, ids: DetectorIds, sumo: Any):
+        """`sumo` is libsumo."""
         self._groups = len(network.groups)
         self._links = len(network.links)
         self._group_link = network.group_link
@@ -31,34 +33,79 @@ class Eyes:
             for link in range(self._links)
         ]
         self._exits, self._exit_link = _flat([(*a, *b) for a, b in zip(turn_exits, ids.parting, strict=True)])
+        self._group_areas = ids.group
+        self._group_before = [ids.upstream[link] for link in self._group_link]
+        self._group_stop_line = ids.group_stop_line
         self._step_s = network.control_step_s
+        self._halting = sumo.lanearea.getLastStepHaltingNumber
+        self._present = sumo.lanearea.getLastStepVehicleNumber
+        self._counted = sumo.inductionloop.getIntervalVehicleNumber
+        self._since_s = sumo.inductionloop.getTimeSinceDetection
         self.x_veh = np.zeros(self._links)
         """(Z,) vehicles on each link when the control step began."""
 
-    def look(self, sumo: Any, time_s: float, heads: Heads, free: Bools) -> View:
-        """The view at this moment. `sumo` is libsumo."""
-        area, loop = sumo.lanearea, sumo.inductionloop
-        return View(
-            time_s=time_s,
-            stage=heads.stage.copy(),
-            free=free,
-            waiting_veh=self._by_group(area.getLastStepHaltingNumber),
-            near_veh=self._by_group(area.getLastStepVehicleNumber),
-            x_veh=self._now_veh(time_s, loop.getIntervalVehicleNumber),
-        )
+    def waiting_veh(self) -> Floats:
+        """(G,) standing in the lane-area detectors."""
+        return self._by_group(self._halting)
 
-    def _now_veh(self, time_s: float, counted: Any) -> Floats:
+    def near_veh(self) -> Floats:
+        """(G,) in the lane-area detectors, moving or not."""
+        return self._by_group(self._present)
+
+    def now_veh(self, time_s: float) -> Floats:
+        """(Z,) vehicles on each link at this moment."""
         if time_s % self._step_s == 0:
             return self.x_veh
+        counted = self._counted
         entered = np.bincount(self._entry_link, [counted(name) for name in self._entries], self._links)
         left = np.bincount(self._exit_link, [counted(name) for name in self._exits], self._links)
         return np.asarray(np.maximum(self.x_veh + entered - left, 0.0))
 
+    def near_one_veh(self, group: int) -> float:
+        """In the lane-area detectors of one lane group, moving or not."""
+        own, before = self._group_areas[group], self._group_before[group]
+        veh = float(sum(map(self._present, own)))
+        return veh + float(self._share[group]) * sum(map(self._present, before)) if before else veh
+
+    def gap_one_s(self, group: int) -> float:
+        """Since a vehicle was last on the stop-line loops of one lane group."""
+        return float(min(map(self._since_s, self._group_stop_line[group])))
+
     def _by_group(self, getter: Any) -> Floats:
         """(G,) a count by lane group; who is before the lanes part is shared out as the traffic is."""
-        own = np.bincount(self._area_group, [getter(name) for name in self._areas], self._groups)
+        own = np.bincount(self._area_group, list(map(getter, self._areas)), self._groups)
+        if not self._before:
+            return own.astype(float)
         before = np.bincount(self._before_link, [getter(name) for name in self._before], self._links)
         return np.asarray(own + before[self._group_link] * self._share)
+
+
+class Sight:
+    """The view at one moment (contract.View)."""
+
+    def __init__(self, eyes: Eyes, heads: Heads, time_s: float, free: Bools):
+        self.time_s = time_s
+        self.stage = heads.stage.copy()
+        self.begin_s = heads.begin_s.copy()
+        self.free = free
+        self.near_one_veh = eyes.near_one_veh
+        self.gap_one_s = eyes.gap_one_s
+        self._eyes = eyes
+
+    @cached_property
+    def waiting_veh(self) -> Floats:
+        """(G,) standing in the lane-area detectors, by lane group."""
+        return self._eyes.waiting_veh()
+
+    @cached_property
+    def near_veh(self) -> Floats:
+        """(G,) in the lane-area detectors, moving or not, by lane group."""
+        return self._eyes.near_veh()
+
+    @cached_property
+    def x_veh(self) -> Floats:
+        """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
+        return self._eyes.now_veh(self.time_s)
 
 
 def _flat(groups: Sequence[Sequence[str]]) -> tuple[list[str], Ints]:

@@ -12,6 +12,8 @@ from utn_sumo.contract import Bools, Floats, Ints, Network, Stage, View
 
 MOST_PATIENCE_S = 150.0
 """A stage that somebody has waited for so long comes next, whatever is wished."""
+LOOK_S = 5.0
+"""Time between two looks at who waits."""
 
 
 class Heads:
@@ -25,45 +27,59 @@ class Heads:
         """(J,) stage that each junction shows, or is on its way to."""
         self.begin_s = np.zeros(len(network.junctions))
         """(J,) when it began, or will."""
+        self._ready_s = self.network.min_green_s[self.stage]
+        """(J,) when it has had its least green."""
         self._ways: dict[tuple[int, int], Phases] = {}
         self._times = [Times.of(network, junction) for junction in network.junctions]
         self._called_s = np.zeros(len(network.stages))
         """(S,) since when somebody has been waiting for each stage."""
+        self._look_s = 0.0
+        """When it is looked again who waits."""
+        self._overdue: list[int] = []
+        """Stages that somebody has waited for too long, the longest last."""
         self._due: list[list[tuple[float, str]]] = [[] for _ in network.junctions]
         """(time, letters) still to be shown, by junction."""
-        self._served = (network.serves.astype(float) @ _turn_groups(network)) > 0
-        """(S, G) lane groups that a stage lets go."""
+        self.next_s = np.inf
+        """When the next letters are due."""
+        self._served = np.sign(network.serves.astype(float) @ _turn_groups(network))
+        """(S, G) 1 where a stage lets a lane group go."""
         self._walked = np.array([_is_walked(network, stage) for stage in network.stages])
         """(S,) stages in which pedestrians go, whom no detector sees."""
 
     def start(self, now_s: float) -> None:
         """Show every junction's first stage."""
         self.begin_s[:] = now_s
+        self._ready_s = now_s + self.network.min_green_s[self.stage]
         for index, stage in enumerate(self.stage):
             self._show(index, self.network.stages[stage].state)
 
-    def next_s(self) -> float:
-        """When the next letters are due."""
-        return min((due[0][0] for due in self._due if due), default=np.inf)
-
     def advance(self, now_s: float) -> None:
         """Show the letters that are due by now."""
+        if now_s < self.next_s:
+            return
         for index, due in enumerate(self._due):
             while due and due[0][0] <= now_s:
                 self._show(index, due.pop(0)[1])
+        self.next_s = min((due[0][0] for due in self._due if due), default=np.inf)
 
     def free(self, now_s: float) -> Bools:
         """(J,) junctions whose stage has had its least green: they may go on to another."""
-        return now_s - self.begin_s >= self.network.min_green_s[self.stage]
+        return np.asarray(now_s >= self._ready_s)
 
     def patient(self, wish: Ints, view: View) -> Ints:
         """(J,) the wish, but for stages that somebody has waited for too long: these come next, the longest first."""
-        called = self._walked | (self._served @ view.waiting_veh > 0)
-        called[view.stage] = False
-        self._called_s[~called] = view.time_s
-        waited_s = view.time_s - self._called_s
+        if view.time_s >= self._look_s:
+            called = self._walked | (self._served @ view.waiting_veh > 0)
+            called[view.stage] = False
+            self._called_s[~called] = view.time_s
+            waited_s = view.time_s - self._called_s
+            late = np.flatnonzero(waited_s >= MOST_PATIENCE_S)
+            self._overdue = sorted(late.tolist(), key=lambda stage: waited_s[stage])
+            self._look_s = view.time_s + LOOK_S
+        if not self._overdue:
+            return wish
         kept = wish.copy()
-        for stage in sorted(np.flatnonzero(waited_s >= MOST_PATIENCE_S), key=lambda stage: waited_s[stage]):
+        for stage in self._overdue:
             kept[self.network.stages[stage].junction] = stage
         return kept
 
@@ -80,6 +96,8 @@ class Heads:
         due.append((at_s, self.network.stages[stage].state))
         self._due[index] = due
         self.stage[index], self.begin_s[index] = stage, at_s
+        self._ready_s[index] = at_s + self.network.stages[stage].min_green_s
+        self.next_s = min(self.next_s, due[0][0])
         self.advance(now_s)
 
 

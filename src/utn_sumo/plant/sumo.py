@@ -19,9 +19,9 @@ import numpy as np
 
 from utn_sumo import detectors
 from utn_sumo.case import Case
-from utn_sumo.contract import SAMPLE_S, Execution, Floats, Measurement, Network, Plan, State
-from utn_sumo.errors import PlantError
-from utn_sumo.plant.eyes import Eyes
+from utn_sumo.contract import SAMPLE_S, Bools, Execution, Floats, Ints, Measurement, Network, Plan, State, View
+from utn_sumo.errors import PlanError, PlantError
+from utn_sumo.plant.eyes import Eyes, Sight
 from utn_sumo.plant.heads import Heads
 from utn_sumo.signals import cycle_phases
 
@@ -82,13 +82,17 @@ class SumoPlant:
         self.decision_time_s = 0.0
         """Wall time of the execution's decisions, reading what they are made by included."""
         self.truth: Truth | None = None
+        self.waiting: list[tuple[float, Bools]] = []
+        """(time, whether somebody stands before the stop line (G,)) at each sample, for the record."""
+        self.failures: list[str] = []
+        """What an execution did wrong, whose junctions then kept their stages."""
         self._ids = detectors.ids(network)
         self._entered: list[tuple[float, Floats]] = []
         """(time, what the entry loops have counted since the control step began) at each reading."""
         self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
         self._execution = execution
         self._heads = Heads(network, self._show)
-        self._eyes = Eyes(network, self._ids)
+        self._eyes: Any = None
         self._decision_s = 0.0
         """When the execution is asked next."""
         self._sumo: Any = None
@@ -113,6 +117,7 @@ class SumoPlant:
         self.sumo_time_s = time.perf_counter() - started
         SumoPlant._owner = self
         self._sumo = libsumo
+        self._eyes = Eyes(self.network, self._ids, libsumo)
         for edge, lanes in self.network.edge_lanes.items():
             whole = libsumo.edge.getLaneNumber(edge) == len(lanes)
             places = [(libsumo.edge, edge)] if whole else [(libsumo.lane, f"{edge}_{lane}") for lane in lanes]
@@ -164,22 +169,23 @@ class SumoPlant:
         try:
             spent_veh_s = 0.0
             self._entered = [(self.time_s, np.zeros(len(self.network.links)))]
+            sampled_s = self.time_s
             if self._execution is not None and state is not None:
-                self._execution.begin(plan, state)
                 self._eyes.x_veh = state.x_veh
+                self._begin(self._execution, plan, state)
             while self.time_s < end_s:
-                before_s = self.time_s
                 switched_s = self._switch(plan) if self._execution is None else self._decide(self._execution)
                 sample_s = (self.time_s // SAMPLE_S + 1) * SAMPLE_S
                 self.time_s = min(sample_s, end_s, switched_s)
                 self._step()
                 if self._execution is not None and self.time_s % SAMPLE_S and self.time_s < end_s:
-                    spent_veh_s += self._present() * (self.time_s - before_s)
                     continue
                 self._entered.append((self.time_s, self._entered_so_far()))
                 x_veh = self._by_link("getLastStepVehicleNumber")
                 np.maximum(peak_x, x_veh, out=peak_x)
-                spent_veh_s += self._present() * (self.time_s - before_s)
+                spent_veh_s += self._present() * (self.time_s - sampled_s)
+                sampled_s = self.time_s
+                self.waiting.append((self.time_s, self._eyes.waiting_veh() > 0))
                 queue_veh = self._by_link("getLastStepHaltingNumber")
                 np.maximum(peak_queue, queue_veh, out=peak_queue)
             pending = self._sumo.edge.getPendingVehicles
@@ -241,13 +247,40 @@ class SumoPlant:
         if self.time_s >= self._decision_s:
             free = heads.free(self.time_s)
             if free.any():
-                view = self._eyes.look(self._sumo, self.time_s, heads, free)
-                wish = heads.patient(execution.wish(view), view)
-                for index in np.flatnonzero(free & (wish != heads.stage)):
-                    heads.switch(int(index), int(wish[index]), self.time_s)
+                view = Sight(self._eyes, heads, self.time_s, free)
+                wish = heads.patient(self._wish(execution, view), view)
+                if wish is not view.stage:
+                    for index in np.flatnonzero(free & (wish != heads.stage)).tolist():
+                        heads.switch(index, int(wish[index]), self.time_s)
             self._decision_s += execution.every_s
         self.decision_time_s += time.perf_counter() - started
-        return min(self._decision_s, heads.next_s())
+        return min(self._decision_s, heads.next_s)
+
+    def _begin(self, execution: Execution, plan: Plan, state: State) -> None:
+        started = time.perf_counter()
+        try:
+            execution.begin(plan, state)
+        except Exception as error:  # noqa: BLE001 - a foreign execution may raise anything
+            self._failed(error)
+        self.decision_time_s += time.perf_counter() - started
+
+    def _wish(self, execution: Execution, view: View) -> Ints:
+        """What the execution wishes; the present stages if it fails to name stages of the junctions."""
+        try:
+            wish = np.asarray(execution.wish(view))
+            if wish is view.stage:
+                return wish
+            if wish.shape != view.stage.shape or any(
+                self.network.stages[wish[index]].junction != index for index in (wish != view.stage).nonzero()[0]
+            ):
+                raise PlanError(f"{wish.tolist()} is no stage for each junction")  # noqa: TRY301 - one way out
+        except Exception as error:  # noqa: BLE001 - a foreign execution may raise anything
+            self._failed(error)
+            return view.stage
+        return wish
+
+    def _failed(self, error: Exception) -> None:
+        self.failures.append(f"at {self.time_s:g} s execution: {type(error).__name__}: {error}")
 
     def _show(self, index: int, state: str) -> None:
         self._sumo.trafficlight.setRedYellowGreenState(self.network.junctions[index].id, state)

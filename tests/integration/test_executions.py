@@ -1,0 +1,167 @@
+"""Any planner with any execution: safe, recorded, and what goes wrong is said in one line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.integration import odd_nets
+
+from utn_sumo import bridge, monitor
+from utn_sumo.contract import Network
+from utn_sumo.controllers import EXECUTION, registered
+from utn_sumo.detectors import ids
+from utn_sumo.errors import ControllerError, SettingError, UtnError
+from utn_sumo.plant.eyes import Eyes, Sight
+from utn_sumo.plant.heads import Heads
+from utn_sumo.scenario import scenario
+
+Run = Callable[..., tuple[dict[str, Any], Path]]
+
+OWN = """
+class Keeps:
+    def __init__(self, network, every_s=5):
+        self.every_s = every_s
+    def begin(self, plan, state):
+        pass
+    def wish(self, view):
+        return view.stage
+
+class Raises(Keeps):
+    def wish(self, view):
+        raise RuntimeError("not today")
+
+class Strays(Keeps):
+    def wish(self, view):
+        return view.stage[::-1]
+
+class Hasty(Keeps):
+    def __init__(self, network):
+        self.every_s = 0
+
+class Idle:
+    def __init__(self, network):
+        pass
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> str:
+    path = tmp_path / "own.py"
+    path.write_text(OWN, encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize("controller", ["fixed", "dmpc", "cmpc", "priced"])
+@pytest.mark.parametrize("execution", ["exact", *registered(EXECUTION)])
+def test_any_planner_runs_with_any_execution(run_of: Run, controller: str, execution: str) -> None:
+    result, folder = run_of(controller=controller, execution=execution, hours=0.2)
+    assert result["execution"] == execution
+    assert (result["unsafe_signal_s"], result["unsafe_reasons"]) == (0, [])
+    assert (result["fallbacks"], result["fallback_reasons"]) == (0, [])
+    assert result["arrived"] > 200
+    assert result["longest_red_s"] <= 180
+    assert json.loads((folder / "result.json").read_text(encoding="utf-8"))["execution"] == execution
+
+
+@pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
+def test_greens_that_end_early_are_safe_on_odd_nets(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    chosen = scenario(net=str(make(tmp_path)), controller="fixed", execution="actuated", seed=5)
+    result = bridge.run(chosen, tmp_path / "run")
+    assert (result["unsafe_signal_s"], result["unsafe_reasons"]) == (0, [])
+    assert (result["fallbacks"], result["fallback_reasons"]) == (0, [])
+    assert result["arrived"] > 0
+    assert result["longest_red_s"] <= 180
+
+
+def test_without_a_name_it_is_the_controllers_own_or_exact(run_of: Run) -> None:
+    for controller, execution in (("max_wave", "max_wave"), ("fixed", "exact")):
+        default, _ = run_of(controller=controller, hours=0.2)
+        named, _ = run_of(controller="fixed", execution=execution, hours=0.2)
+        assert default["execution"] == execution
+        assert default["total_delay_veh_h"] == named["total_delay_veh_h"]
+
+
+def test_greens_that_end_early_save_delay_and_keep_the_order_of_stages(run_of: Run, utn17: Network) -> None:
+    settings = {"controller": "fixed", "hours": 0.5, "demand": 0.6}
+    exact, early = (run_of(execution=execution, **settings) for execution in ("exact", "actuated"))
+    assert early[0]["total_delay_veh_h"] < 0.75 * exact[0]["total_delay_veh_h"]
+    switches = monitor.read_switches(early[1] / "signals.xml")
+    for junction in utn17.junctions:
+        stages = {utn17.stages[stage].state: place for place, stage in enumerate(junction.stages)}
+        places = [stages[state] for _, state in switches[junction.id] if state in stages]
+        in_order = [(after - before) % len(stages) == 1 for before, after in pairwise(places) if after != before]
+        # Out of order only over a stage that nobody was before.
+        assert np.mean(in_order) > 0.5
+
+
+@pytest.mark.parametrize(("name", "why"), [("Raises", "not today"), ("Strays", "no stage for each junction")])
+def test_an_execution_that_fails_is_written_down_and_everybody_still_gets_green(
+    own: str, name: str, why: str, tmp_path: Path
+) -> None:
+    chosen = scenario(controller="fixed", execution=f"{own}:{name}", hours=0.2)
+    result = bridge.run(chosen, tmp_path / "run")
+    assert result["fallbacks"] > 0
+    assert why in result["fallback_reasons"][0]
+    assert result["unsafe_signal_s"] == 0
+    assert result["arrived"] > 50
+
+
+@pytest.mark.parametrize(
+    ("settings", "kind", "complaint"),
+    [
+        ({"execution": "actuatd"}, ControllerError, "execution 'actuatd' is unknown: did you mean 'actuated'?"),
+        ({"execution": "none.py:Own"}, ControllerError, "there is no file 'none.py'"),
+        ({"execution": "OWN:Hasty"}, ControllerError, "make `every_s` 1 or more"),
+        ({"execution": "OWN:Idle"}, ControllerError, "lacks `every_s`"),
+        ({"execution": "actuated", "settings": {"execution": {"gap": 2}}}, SettingError, "did you mean 'gap_s'?"),
+        ({"execution": "actuated", "settings": {"execution": {"gap_s": 0}}}, SettingError, "'gap_s' is 0"),
+        ({"execution": "actuated", "settings": {"execution": 2}}, SettingError, "must be a table"),
+        ({"execution": "exact", "settings": {"execution": {"gap_s": 2}}}, SettingError, "'execution.gap_s' is 2"),
+        ({"settings": {"execution": {"gap_s": 2}}}, SettingError, "name the execution that takes it"),
+        ({"controller": "actuated", "execution": "exact"}, SettingError, "leave it out"),
+        ({"controller": "native", "execution": "priced"}, SettingError, "leave it out"),
+    ],
+)
+def test_a_mistake_is_named_and_leaves_nothing_behind(
+    settings: dict[str, Any], kind: type[UtnError], complaint: str, own: str, tmp_path: Path
+) -> None:
+    settings = {"controller": "fixed", **settings}
+    settings |= {"execution": settings["execution"].replace("OWN", own)} if "execution" in settings else {}
+    with pytest.raises(kind) as caught:
+        bridge.run(scenario(**settings), tmp_path / "run")
+    assert complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+class Counting:
+    """A libsumo whose detectors see nobody, and which counts how often each kind of reading is made."""
+
+    def __init__(self) -> None:
+        self.asked: dict[str, int] = {}
+        self.lanearea = self.inductionloop = self
+
+    def __getattr__(self, name: str) -> Callable[[str], int]:
+        def read(_: str) -> int:
+            self.asked[name] = self.asked.get(name, 0) + 1
+            return 0
+
+        return read
+
+
+def test_what_nobody_asks_for_is_not_read_and_nothing_is_read_twice(utn17: Network) -> None:
+    sumo = Counting()
+    eyes, heads = Eyes(utn17, ids(utn17), sumo), Heads(utn17, lambda index, state: None)
+    sight = Sight(eyes, heads, 7.0, heads.free(7.0))
+    assert sumo.asked == {}
+    assert (sight.near_veh == sight.near_veh).all()
+    assert sumo.asked == {"getLastStepVehicleNumber": sum(map(len, ids(utn17).area))}
+    sight.gap_one_s(0)
+    assert sumo.asked["getTimeSinceDetection"] == len(utn17.groups[0].lanes)
+    assert "getLastStepHaltingNumber" not in sumo.asked

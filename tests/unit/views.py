@@ -1,0 +1,46 @@
+"""What an execution sees, made up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from utn_sumo.contract import Bools, Floats, Ints, Network
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A contract.View of arrays."""
+
+    time_s: float
+    stage: Ints
+    begin_s: Floats
+    free: Bools
+    waiting_veh: Floats
+    near_veh: Floats
+    x_veh: Floats
+    gap_s: Floats
+
+    def near_one_veh(self, group: int) -> float:
+        return float(self.near_veh[group])
+
+    def gap_one_s(self, group: int) -> float:
+        return float(self.gap_s[group])
+
+
+def scene(
+    network: Network, time_s: float = 0.0, stage: Ints | None = None, *, veh: Floats | float = 0.0, gap_s: float = 0.0
+) -> Scene:
+    """Everybody stands; every junction shows its first stage and is free unless it is said otherwise."""
+    groups = np.zeros(len(network.groups))
+    return Scene(
+        time_s,
+        np.array([junction.stages[0] for junction in network.junctions]) if stage is None else stage,
+        np.zeros(len(network.junctions)),
+        np.ones(len(network.junctions), dtype=bool),
+        groups + veh,
+        groups + veh,
+        np.zeros(len(network.links)),
+        groups + gap_s,
+    )
