@@ -43,10 +43,8 @@ class Proportional:
     def _take_up(self, network: Network, settings: SplitSettings) -> None:
         self.network = network
         self._standing = settings.count == "queue"
-        self._stage, self._turn = splits.telling(network)
         self._lanes = np.array([len(group.lanes) for group in network.groups], dtype=float)
-        pairs = np.stack([self._stage, network.turn_group[self._turn]])
-        (self._pair_stage, self._pair_group), self._pair = np.unique(pairs, axis=1, return_inverse=True)
+        self._fullest = splits.Fullest(network, self._lanes)
 
     def plan(self, state: State, forecast: Forecast) -> Plan:  # noqa: ARG002 - it goes by what is there
         """Greens in proportion to what the stages are worth; equal ones where nobody is before any."""
@@ -54,10 +52,7 @@ class Proportional:
 
     def worth(self, state: State) -> Floats:
         """(S,) vehicles per lane."""
-        veh = np.bincount(self._pair, self.veh(state)[self._turn], len(self._pair_stage))
-        fullest = np.zeros(len(self.network.stages))
-        np.maximum.at(fullest, self._pair_stage, veh / self._lanes[self._pair_group])
-        return fullest
+        return self._fullest.by_stage(self.veh(state))
 
     def veh(self, state: State) -> Floats:
         """(M,) vehicles that count, by turn."""
@@ -94,6 +89,7 @@ class CyclicMaxPressure(Proportional):
         self._room = {"lane": self._lanes, "storage": per_lane_veh * self._lanes, "none": one}[chosen.per]
         self._fed = network.turn_next != EXIT
         self._next = np.maximum(network.turn_next, 0)
+        self._stage, self._turn = splits.telling(network)
 
     def worth(self, state: State) -> Floats:
         """(S,) pressure."""

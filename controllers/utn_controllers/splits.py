@@ -66,6 +66,23 @@ def telling(network: Network) -> tuple[Ints, Ints]:
     return stage, turn
 
 
+class Fullest:
+    """Of the lane groups that a stage serves, the fullest: what is to go over its turns there, for their room (G,)."""
+
+    def __init__(self, network: Network, room: Floats):
+        stage, self._turn = telling(network)
+        pairs = np.stack([stage, network.turn_group[self._turn]])
+        (self._stage, group), self._pair = np.unique(pairs, axis=1, return_inverse=True)
+        self._room, self._stages = room[group], len(network.stages)
+
+    def by_stage(self, turns: Floats) -> Floats:
+        """(S,) of what is to go over each turn (M,); 0 where a stage serves nobody."""
+        held = np.bincount(self._pair, turns[self._turn], len(self._stage))
+        fullest = np.zeros(self._stages)
+        np.maximum.at(fullest, self._stage, held / self._room)
+        return fullest
+
+
 def turn_flow_veh_s(network: Network, fraction: Floats) -> Floats:
     """(M,) what each turn lets through with green and a queue: its share of its lane group's saturation flow."""
     group = network.turn_group

@@ -16,7 +16,7 @@ from tests.integration import odd_nets
 from utn_controllers.cyclic import CyclicMaxPressure, Proportional
 from utn_controllers.tuc import TUC
 from utn_sumo import controllers, signals
-from utn_sumo.contract import EXIT, Network, State
+from utn_sumo.contract import EXIT, Forecast, Network, State
 from utn_sumo.errors import SettingError
 from utn_sumo.testing import HARD, random_forecast, random_state
 
@@ -39,6 +39,10 @@ every = pytest.mark.parametrize(("kind", "settings"), EVERY)
 def nobody(network: Network) -> State:
     state, _ = HARD["empty"](network, np.random.default_rng(1), 1)
     return replace(state, fraction=network.fraction)
+
+
+def nobody_comes(network: Network) -> Forecast:
+    return Forecast(np.zeros((1, len(network.links))))
 
 
 def stage_of(network: Network, link: int) -> int:
@@ -98,8 +102,10 @@ def test_traffic_tenfold_everywhere_is_shared_out_alike(utn17: Network, seed: in
 
 
 @every
-def test_where_nobody_is_the_cycle_is_shared_out_equally(utn17: Network, kind: Any, settings: Any) -> None:
-    plan = kind(utn17, **settings).plan(nobody(utn17), random_forecast(utn17, np.random.default_rng(1), 1))
+def test_where_nobody_is_nor_is_expected_the_cycle_is_shared_out_equally(
+    utn17: Network, kind: Any, settings: Any
+) -> None:
+    plan = kind(utn17, **settings).plan(nobody(utn17), nobody_comes(utn17))
     assert signals.admit(plan, utn17).green_s == pytest.approx(utn17.equal_split().green_s, abs=1)
 
 
@@ -108,7 +114,7 @@ def test_who_waits_outside_counts_as_before_the_stage(utn17: Network, kind: Any,
     outside = np.zeros(len(utn17.links))
     outside[0] = 30
     state = replace(nobody(utn17), source_queue_veh=outside)
-    green_s = kind(utn17, **settings).plan(state, random_forecast(utn17, np.random.default_rng(1), 1)).green_s
+    green_s = kind(utn17, **settings).plan(state, nobody_comes(utn17)).green_s
     stage = stage_of(utn17, 0)
     assert green_s[stage] > utn17.equal_split().green_s[stage] + 5
 

@@ -60,6 +60,26 @@ def test_the_model_moves_vehicles_from_link_to_link(utn17: Network) -> None:
     assert (utn17.turn_next == EXIT).any()
 
 
+@given(seed=seeds)
+def test_nominal_greens_saturate_the_stages_of_a_junction_alike(utn17: Network, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    state, forecast = random_state(utn17, rng), random_forecast(utn17, rng, 1)
+    green_s = TUC(utn17).nominal_s(state, forecast)
+    onward = np.zeros((len(utn17.links), len(utn17.links)))
+    for turn, fraction in zip(utn17.turns, state.fraction.tolist(), strict=True):
+        if turn.next_link != EXIT:
+            onward[turn.next_link, turn.link] += fraction
+    flow = np.linalg.solve(np.eye(len(onward)) - onward, forecast.demand_veh[0])
+    load = np.zeros(len(green_s))
+    for link, served in enumerate(flow / utn17.saturation_flow_veh_s):
+        load[utn17.serves[:, utn17.turn_link == link].any(axis=1)] = served
+    for junction in utn17.junctions:
+        stages = np.array(junction.stages)
+        degree, above = load[stages] / green_s[stages], green_s[stages] > utn17.min_green_s[stages] + 1e-6
+        assert degree[above] == pytest.approx(degree[above].max(initial=0.0), rel=1e-3)
+        assert (degree[~above] <= degree.max() * (1 + 1e-3)).all()
+
+
 @given(seed=seeds, r=rs)
 def test_what_greens_can_reach_is_brought_to_the_least(utn17: Network, seed: int, r: float) -> None:
     """The model in closed loop, its greens kept within their leasts, comes to where no greens would better it."""
