@@ -74,8 +74,8 @@ class CyclicMaxPressure(Proportional):
     That is the sum over its turns of their saturation flows times vehicles before them less those behind them, as
     these turn on (Varaiya, Transportation Research C 36, 2013); nothing of a turn with more behind it. What a lane
     group holds counts whole for each of its turns, because it is one queue. Le et al. (Transportation Research C 58,
-    2015) share a cycle out among all stages, by exp(pressure); in proportion it has no scale to set (Levin, Journal of
-    Transportation Engineering A 149, 2023).
+    2015) share a fixed cycle out among all stages, by exp(pressure); in proportion to it there is no scale to set.
+    Cyclic forms are reviewed by Levin, Journal of Transportation Engineering A 149 (2023).
     """
 
     Settings = PressureSettings

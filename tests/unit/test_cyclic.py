@@ -202,3 +202,15 @@ def test_a_part_with_a_stage_that_serves_everybody_is_planned(utn17: Network, ki
     assert green_s.sum() == pytest.approx(net.green_budget_s[0])
     alone = replace(part, stages=(whole,), junctions=(replace(part.junctions[0], stages=(0,)),))
     assert kind(alone).plan(state, forecast).green_s == pytest.approx(alone.green_budget_s)
+
+
+def test_who_has_green_in_every_stage_needs_no_share(utn17: Network) -> None:
+    part = utn17.part(3)
+    always = tuple(replace(stage, turns=tuple(sorted({0, *stage.turns}))) for stage in part.stages)
+    net = replace(part, stages=always)
+    controller, forecast = Proportional(net, count="queue"), nobody_comes(net)
+    state = replace(nobody(net), q_veh=np.full(len(net.turns), 10.0))
+    once, again = (controller.plan(each, forecast).green_s for each in (state, with_more(net, state, 0, 50)))
+    assert again == pytest.approx(once)
+    other = int(np.flatnonzero(net.serves.sum(axis=0) == 1)[-1])
+    assert controller.plan(with_more(net, state, other, 5), forecast).green_s != pytest.approx(once)
