@@ -55,7 +55,7 @@ def complaint(net: Network, name: str, kind: type[UtnError] = ControllerError, *
 
 
 def test_our_own_controllers_are_registered_by_name(utn17: Network) -> None:
-    assert {"fixed", "dmpc"} <= set(controllers.registered())
+    assert {"fixed", "dmpc", "tuc", "proportional", "cyclic_max_pressure"} <= set(controllers.registered())
     assert isinstance(controllers.build("fixed", utn17, {}), FixedTime)
     assert isinstance(controllers.build("dmpc", utn17, {"horizon": 5}), DistributedMPC)
 

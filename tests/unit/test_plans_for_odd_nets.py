@@ -12,8 +12,10 @@ import pytest
 
 from tests.integration import odd_nets
 from tests.integration.odd_nets import row
+from utn_controllers.cyclic import CyclicMaxPressure, Proportional
 from utn_controllers.mpc.central import CentralizedMPC
 from utn_controllers.mpc.distributed import DistributedMPC
+from utn_controllers.tuc import TUC
 from utn_sumo import signals
 from utn_sumo.contract import EXIT, Network
 from utn_sumo.testing import HARD
@@ -52,7 +54,7 @@ def with_turns_out_of_use(net: Network) -> Network:
     return replace(net, turns=tuple(replace(turn, fraction=own) for turn, own in turns))
 
 
-@pytest.mark.parametrize("kind", [CentralizedMPC, DistributedMPC])
+@pytest.mark.parametrize("kind", [CentralizedMPC, DistributedMPC, TUC, Proportional, CyclicMaxPressure])
 @pytest.mark.parametrize("make", NETS, ids=lambda make: make.__name__)
 @pytest.mark.parametrize("idle", [False, True], ids=["", "idle"])
 def test_there_is_a_plan_for_every_hard_state(street_of: StreetOf, make: Any, kind: Any, idle: bool) -> None:
