@@ -26,15 +26,20 @@ def registered() -> dict[str, EntryPoint]:
 
 def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
     """The controller called `name`, built for `network`. Raises ControllerError or SettingError."""
-    factory = _from_file(name) if ".py:" in name else _registered(name)
-    if not callable(factory):
-        raise ControllerError(f"controller {name!r} is {factory!r}: name a class")
-    controller = made(name, factory, settings, network)
+    controller = made(name, maker(name), settings, network)
     if not isinstance(controller, Controller):
         raise ControllerError(
             f"controller {name!r} lacks `horizon` or `plan(state, forecast)`: see contract.Controller"
         )
     return controller
+
+
+def maker(name: str) -> Callable[..., Any]:
+    """What makes the controller called `name`: as a rule its class. Raises ControllerError."""
+    factory = _from_file(name) if ".py:" in name else _registered(name)
+    if not callable(factory):
+        raise ControllerError(f"controller {name!r} is {factory!r}: name a class")
+    return factory  # type: ignore[no-any-return]
 
 
 def made(name: str, factory: Callable[..., T], settings: dict[str, Any], *given: Any) -> T:
