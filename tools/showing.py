@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from comparing import COUNTED, WAITED, Figures, measure
 
 COLORS = ("#000000", "#0b6fa4", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7b3294", "#8c6d31", "#999999")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
 STYLES = ("-", "--", ":")
 
 
@@ -100,8 +101,8 @@ def draw(rows: Sequence[Figures], folder: Path) -> list[Path]:
         if not own:
             continue
         # Side by side where they would hide each other.
-        apart = 0.16 * min(np.diff(demands), default=0.2) / max(len(names), 4)
-        figure, axes = plt.subplots(figsize=(8.4, 4.8), layout="constrained")
+        apart = 0.7 * min(np.diff(demands), default=0.2) / max(len(names), 8)
+        figure, axes = plt.subplots(figsize=(10.5, 5.6), layout="constrained")
         for index, name in enumerate(names):
             line = sorted((row for row in own if row["controller"] == name), key=lambda row: row["demand"])
             x = np.array([row["demand"] for row in line]) + apart * (index - (len(names) - 1) / 2)
@@ -116,7 +117,17 @@ def draw(rows: Sequence[Figures], folder: Path) -> list[Path]:
                 "linestyle": STYLES[index // len(COLORS) % len(STYLES)],
             }
             ends = [np.minimum(mean - low, 0.9 * mean), high - mean]
-            axes.errorbar(x, mean, ends, **shape, markersize=5, linewidth=1.3, capsize=2.5, elinewidth=0.9, label=name)
+            axes.errorbar(
+                x,
+                mean,
+                ends,
+                **shape,
+                markersize=5,
+                linewidth=1.1,
+                capsize=2,
+                elinewidth=0.8,
+                label=textwrap.fill(name, 30),
+            )
             stuck = np.array([bool(row["gridlocked"]) for row in line])
             axes.plot(x[stuck], mean[stuck], marker, color=color, markerfacecolor="white", markersize=5, zorder=4)
         least, most = min(row["mean"] for row in own), max(row["high"] or row["mean"] for row in own)
