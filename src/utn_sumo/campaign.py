@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -18,6 +19,8 @@ from utn_sumo.scenario import scenario
 
 FAILED = "failed"
 """In the place of measures: the one line that says why a run has none."""
+
+STOP = (signal.SIGINT,)
 
 Job = Mapping[str, Any]
 """Settings of a run, as `scenario` takes them."""
@@ -60,6 +63,8 @@ def seeds(text: str) -> list[int]:
 
 
 def _alone(job: Job) -> dict[str, Any]:
+    # The process inherits the mask: a Ctrl-C ends its run, and is silent before and after it.
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP)
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         try:
             return process.submit(_outcome, dict(job)).result()
@@ -70,8 +75,11 @@ def _alone(job: Job) -> dict[str, Any]:
 def _outcome(job: Job) -> dict[str, Any]:
     """What a run gave, told in the process that ran it: an exception of somebody's own may not travel."""
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP)
         return measures(job)
     except UtnError as error:
         return {FAILED: str(error)}
     except Exception as error:  # noqa: BLE001 - whatever a controller raises
         return {FAILED: " ".join(f"{type(error).__name__}: {error}".split())}
+    finally:
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP)

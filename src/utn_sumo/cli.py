@@ -223,7 +223,7 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
     help="A setting and where to search it: low:high, or values with commas, or by itself as far as it may go."
     "  [every number that has both bounds]",
 )
-@click.option("--seed", default=1, show_default=True, help="Seed of the search.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the search.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
 def tune(controller: str, over: tuple[str, ...], seed: int, out: Path | None, **flags: Any) -> None:
     """Search settings of CONTROLLER that make least delay over nets, demands and seeds."""

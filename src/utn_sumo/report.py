@@ -274,8 +274,9 @@ def tuning_table(found: dict[str, Any]) -> None:
     console = Console(width=None if sys.stdout.isatty() else 120)
     states = [trial["state"] for trial in found["trials"]]
     failed = len(states) - states.count("whole") - states.count("cut")
-    title = "{controller}: {scenarios} scenarios, {seeds} seeds".format(**found)
-    view = Table(title=f"{title}; {len(states) - 1} trials, {states.count('cut')} cut short, {failed} failed")
+    console.print("{controller}: scenarios {scenarios}, seeds {seeds}".format(**found), markup=False, highlight=False)
+    console.print(f"trials {len(states) - 1}, cut short {states.count('cut')}, failed {failed}", highlight=False)
+    view = Table()
     for head in ("setting", "default", "best"):
         view.add_column(head, justify="left" if head == "setting" else "right")
     best = found["best"]

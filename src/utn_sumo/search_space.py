@@ -176,8 +176,8 @@ def _said(text: str, field: FieldInfo, where: str) -> Range | Choice:
     try:
         values = [check.validate_python(_value(word.strip())) for word in words]
     except ValidationError as error:
-        message = error.errors()[0]["msg"]
-        raise SettingError(f"--over {text!r}: {message[0].lower()}{message[1:]}") from error
+        message = error.errors()[0]["msg"].replace("Input should", "it must")
+        raise SettingError(f"--over {text!r}: {message}") from error
     if not colon:
         return Choice(tuple(dict.fromkeys(values)))
     if kind not in (int, float) or not all(map(math.isfinite, values)) or values[0] >= values[1]:
