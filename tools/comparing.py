@@ -78,13 +78,15 @@ def label(job: Job) -> str:
     return f"{job['controller']} ({given})" if given else str(job["controller"])
 
 
-def results(wanted: Sequence[Job], workers: int, record: Path | None, tick: Callable[[], None]) -> list[Figures]:
+def results(wanted: Sequence[Job], workers: int | None, record: Path | None, tick: Callable[[], None]) -> list[Figures]:
     """Measures of every run, or why it has none; what `record` has of them is not run again. Raises ResultError.
 
     Each is a line of `record` as soon as it is there. A run that failed is tried again the next time.
     """
     known = {} if record is None else read(record)
     todo = [job for job in wanted if campaign.FAILED in known.get(_key(job), {campaign.FAILED: ""})]
+    for _ in range(len(wanted) - len(todo)):
+        tick()
     with campaign.started(workers) as start:
         started = {start(job): job for job in todo}
         for future in as_completed(started):
