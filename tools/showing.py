@@ -101,7 +101,9 @@ def draw(rows: Sequence[Figures], folder: Path) -> list[Path]:
         if not own:
             continue
         # Side by side where they would hide each other.
-        apart = 0.7 * min(np.diff(demands), default=0.2) / max(len(names), 8)
+        span = demands[-1] - demands[0] or 0.2
+        apart = min(0.7 * min(np.diff(demands), default=span) / len(names), 0.012 * span)
+        aside = max(0.08 * span, 0.6 * apart * len(names))
         figure, axes = plt.subplots(figsize=(10.5, 5.6), layout="constrained")
         for index, name in enumerate(names):
             line = sorted((row for row in own if row["controller"] == name), key=lambda row: row["demand"])
@@ -132,6 +134,7 @@ def draw(rows: Sequence[Figures], folder: Path) -> list[Path]:
             axes.plot(x[stuck], mean[stuck], marker, color=color, markerfacecolor="white", markersize=5, zorder=4)
         least, most = min(row["mean"] for row in own), max(row["high"] or row["mean"] for row in own)
         axes.set(yscale="log", ylim=(0.7 * least, 1.3 * most), xticks=demands, xlabel="demand")
+        axes.set_xlim(demands[0] - aside, demands[-1] + aside)
         axes.set_xticks([], minor=True)
         formatter = mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}")
         axes.yaxis.set_major_formatter(formatter)
