@@ -2,15 +2,14 @@
 
     python tools/bench.py overhead     control and bridge against the bare `sumo` binary on the same signals
     python tools/bench.py solve        centralized and distributed MPC: gaps, times, scale, failures
-    python tools/bench.py traffic      controllers against each other over demands and seeds
+    python tools/bench.py traffic      controllers against each other over nets, demands and seeds
     python tools/bench.py step         the model's step: what a finer one costs and brings, in prediction and in control
     python tools/bench.py estimate     vehicles estimated from loops that miscount: counting against the filter
     python tools/bench.py forecast     STARIMA: time to fit, and to update and forecast each cycle
     python tools/bench.py foresight    what forecasts are worth in closed loop, against perfect ones
-    python tools/bench.py scenarios    controllers on other people's scenarios: mean delay by seed
     python tools/bench.py scale        a net of 1,000 signals: time to read it, and to step its model
 
-Each prints a table, or with --json one object (traffic, step, estimate, foresight and scenarios: a list of objects).
+Each prints a table, or with --json one object (traffic, step, estimate and foresight: a list of objects).
 """
 
 from __future__ import annotations
@@ -32,12 +31,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import comparing
 import forecasting
 import foreign
+import showing
 import solving
-from utn_sumo import bridge, calibration, mismatch, network, recording, replay, sumo_tools
+from utn_sumo import bridge, calibration, campaign, mismatch, network, recording, replay, report, sumo_tools
 from utn_sumo.contract import Measurement
 from utn_sumo.detectors import Miscount
+from utn_sumo.errors import UtnError
 from utn_sumo.estimation import Estimator
 from utn_sumo.recording import Log
 from utn_sumo.scenario import scenario
@@ -129,52 +131,39 @@ def _text(value: Any) -> str:
 
 
 @bench.command()
-@click.option("--net", default="utn17", show_default=True)
-@click.option("--hours", default=2.0, show_default=True)
-@click.option("--controllers", default="dmpc,fixed", show_default=True)
-@click.option("--demands", default="1.3", show_default=True)
-@click.option("--seeds", default="1,2,3,4,5", show_default=True)
+@click.option("--nets", default=("utn17",), multiple=True, help="Shipped nets, nets, .sumocfg files.  [utn17]")
+@click.option("--hours", type=float, help="Simulated hours of each run.  [2; of a .sumocfg its window]")
+@click.option("--controllers", default="dmpc,fixed", show_default=True, help="Or files as `utn tune` writes them.")
+@click.option("--demands", help="Demands.  [1.3; of a .sumocfg 1.0]")
+@click.option("--seeds", default="1-5", show_default=True, help="Numbers and ranges.")
+@click.option("--workers", type=click.IntRange(1), help="Runs at the same time.  [one a processor]")
+@click.option("--plot", type=click.Path(path_type=Path), help="New folder for a picture a net: delay against demand.")
+@click.option("--out", type=click.Path(path_type=Path), help="File of all results, from which a stopped one goes on.")
 @click.option("--json", "as_json", is_flag=True)
-def traffic(net: str, hours: float, controllers: str, demands: str, seeds: str, as_json: bool) -> None:
-    """Controllers over demands and seeds, in parallel processes; the first one's time spent over the others'."""
-    names = controllers.split(",")
-    jobs: list[dict[str, Any]] = [
-        {"net": net, "hours": hours, "controller": name, "demand": float(demand), "seed": int(seed)}
-        for demand in demands.split(",")
-        for name in names
-        for seed in seeds.split(",")
-    ]
-    with ProcessPoolExecutor(os.cpu_count(), max_tasks_per_child=1) as pool:
-        results = list(pool.map(_traffic_job, jobs))
-    if as_json:
-        click.echo(json.dumps(results))
-        return
-    rows = []
-    for demand in sorted({job["demand"] for job in jobs}):
-        first: dict[int, float] = {}
-        for name in names:
-            runs = [r for r in results if r["controller"] == name and r["demand"] == demand]
-            spent = {r["seed"]: r["total_time_spent_veh_h"] for r in runs}
-            first = first or spent
-            ratios = [first[seed] / spent[seed] if spent[seed] else math.nan for seed in spent]
-            alarms = sum(r["unsafe_signal_s"] + r["fallbacks"] + r["teleports"] for r in runs)
-            rows.append(
-                [
-                    f"{demand:g}",
-                    name,
-                    " ".join(f"{value:.0f}" for value in spent.values()),
-                    f"{statistics.median(spent.values()):.0f}",
-                    f"{statistics.median(first.values()) / (statistics.median(spent.values()) or math.nan):.3f}",
-                    f"{min(ratios):.3f}-{max(ratios):.3f}",
-                    "not known" if runs[0]["gridlock"] is None else str(sum(r["gridlock"] for r in runs)),
-                    str(alarms),
-                ]
-            )
-    _show(
-        f"{net}, {hours:g} h, seeds {seeds}: time spent (veh h); alarms: unsafe s, fallbacks, teleports",
-        ["demand", "controller", "by seed", "median", "ratio of medians", "by seed", "gridlocked", "alarms"],
-        rows,
+def traffic(nets: tuple[str, ...], controllers: str, plot: Path | None, as_json: bool, **given: Any) -> None:
+    """Controllers over nets, demands and seeds: delay, time spent, alarms; the first one against the best other one.
+
+    What takes several has them separated by commas.
+    """
+    jobs = comparing.jobs(
+        _words(",".join(nets)),
+        None if given["demands"] is None else _words(given["demands"]),
+        _words(controllers),
+        campaign.seeds(given["seeds"]),
+        given["hours"],
     )
+    folder = None if plot is None else recording.new_folder(plot, "")
+    with report.counter("runs", len(jobs)) as tick:
+        results = comparing.results(jobs, given["workers"], given["out"], tick)
+    rows = comparing.figures(jobs, results)
+    pictures = [] if folder is None else showing.draw(rows, folder)
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    for table in showing.tables(rows):
+        _show(*table)
+    for line in [*showing.remarks(rows), *map(str, pictures)]:
+        click.echo(line)
 
 
 @bench.command()
@@ -313,7 +302,7 @@ def foresight(forecasts: str, demands: str, noises: str, seeds: str, *, as_json:
         for seed in seeds.split(",")
     ]
     with ProcessPoolExecutor(os.cpu_count(), max_tasks_per_child=1) as pool:
-        results = list(pool.map(_traffic_job, jobs))
+        results = list(pool.map(campaign.measures, jobs))
     delays: dict[tuple[float, float, str], list[float]] = {}
     for job, result in zip(jobs, results, strict=True):
         delays.setdefault((job["demand"], job["noise"], job["forecast"]), []).append(result["total_delay_veh_h"])
@@ -348,37 +337,6 @@ def foresight(forecasts: str, demands: str, noises: str, seeds: str, *, as_json:
 
 
 @bench.command()
-@click.argument("files", nargs=-1, required=True)
-@click.option("--controllers", default="native,fixed,cmpc,dmpc", show_default=True)
-@click.option("--seeds", default="1,2,3", show_default=True)
-@click.option("--workers", default=2, show_default=True)
-@click.option("--json", "as_json", is_flag=True)
-def scenarios(files: tuple[str, ...], controllers: str, seeds: str, workers: int, as_json: bool) -> None:
-    """Controllers on the .sumocfg FILES, each over its own window: mean delay, and what must not happen."""
-    found = foreign.delays(files, controllers.split(","), [int(seed) for seed in seeds.split(",")], workers)
-    if as_json:
-        click.echo(json.dumps(found))
-        return
-    rows = [
-        [
-            Path(each["net"]).parent.name,
-            each["controller"],
-            " ".join(f"{delay:.1f}" for delay in each["mean_delay_s"]),
-            f"{statistics.mean(each['mean_delay_s']):.1f}",
-            str(sum(each["unsafe_signal_s"])),
-            str(sum(each["fallbacks"])),
-            f"{statistics.mean(each['control_time_s']) / statistics.mean(each['sumo_time_s']):.2f}",
-            ", ".join(each["left_alone"]) or "none",
-        ]
-        for each in found
-    ]
-    heads = ["scenario", "controller", "delay by seed (s)", "mean", "unsafe (s)", "fallbacks", "control / SUMO"]
-    _show(f"mean delay, seeds {seeds}", [*heads, "left alone"], rows)
-    for reason in (reason for each in found for reason in each["fallback_reasons"]):
-        click.echo(f"fallback: {reason}")
-
-
-@bench.command()
 @click.option("--side", default=32, show_default=True, help="Signals along each side of the grid.")
 @click.option("--json", "as_json", is_flag=True)
 def scale(side: int, as_json: bool) -> None:
@@ -391,10 +349,9 @@ def scale(side: int, as_json: bool) -> None:
     _show(f"netgenerate grid of {side} x {side} signals", ["", ""], rows)
 
 
-def _traffic_job(job: dict[str, Any]) -> dict[str, Any]:
-
-    with tempfile.TemporaryDirectory() as temporary:
-        return bridge.run(scenario(**job), Path(temporary) / "run")
+def _words(text: str) -> list[str]:
+    """What is separated by commas, each once."""
+    return list(dict.fromkeys(word.strip() for word in text.split(",")))
 
 
 def _show(title: str, heads: list[str], rows: list[list[str]]) -> None:
@@ -407,4 +364,8 @@ def _show(title: str, heads: list[str], rows: list[list[str]]) -> None:
 
 
 if __name__ == "__main__":
-    bench()
+    try:
+        bench()
+    except UtnError as error:
+        click.echo(f"bench: {error}", err=True)
+        sys.exit(2)

@@ -1,4 +1,4 @@
-"""Other people's nets and scenarios: how controllers do on them, and what a net of 1,000 signals costs."""
+"""What a net of 1,000 signals costs: to read it, and to step its model."""
 
 from __future__ import annotations
 
@@ -6,52 +6,17 @@ import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from utn_sumo import bridge, network, sumo_tools
+from utn_sumo import network, sumo_tools
 from utn_sumo.contract import Network
 from utn_sumo.model import LinkModel, ModelState, green_windows
-from utn_sumo.scenario import scenario
 
-KEPT = ("mean_delay_s", "unsafe_signal_s", "fallbacks", "teleports", "arrived", "unfinished", "sumo_time_s")
 STEPS = 20
 """Model steps of which the median is taken."""
-
-
-def delays(
-    files: Sequence[str], controllers: Sequence[str], seeds: Sequence[int], workers: int
-) -> list[dict[str, Any]]:
-    """Runs of scenarios in parallel processes: one object for each file and controller."""
-    jobs = [(file, controller, seed) for file in files for controller in controllers for seed in seeds]
-    with ProcessPoolExecutor(workers, max_tasks_per_child=1) as pool:
-        runs = list(pool.map(_run, jobs))
-    found = []
-    for file in files:
-        for controller in controllers:
-            own = [run for job, run in zip(jobs, runs, strict=True) if job[:2] == (file, controller)]
-            found.append(
-                {
-                    "net": file,
-                    "controller": controller,
-                    "seeds": list(seeds),
-                    **{name: [run[name] for run in own] for name in KEPT},
-                    "control_time_s": [run["control_time_s"] for run in own],
-                    "left_alone": own[0].get("left_alone", {}),
-                    "fallback_reasons": [reason for run in own for reason in run.get("fallback_reasons", [])],
-                }
-            )
-    return found
-
-
-def _run(job: tuple[str, str, int]) -> dict[str, Any]:
-    file, controller, seed = job
-    with tempfile.TemporaryDirectory() as temporary:
-        return bridge.run(scenario(net=file, controller=controller, seed=seed), Path(temporary) / "run")
 
 
 def scale(side: int) -> dict[str, Any]:

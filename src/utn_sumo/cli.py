@@ -220,6 +220,41 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
 
 
 @cli.command()
+@click.argument("controller")
+@click.option("--nets", default="utn17", show_default=True, help="Shipped nets, nets, .sumocfg files, with commas.")
+@click.option("--demands", help="Demands, separated by commas.  [0.6,1.0,1.3; of a .sumocfg 1.0]")
+@click.option("--seeds", default="1-3", show_default=True, help="Numbers and ranges, separated by commas.")
+@click.option("--hours", help="Simulated hours of each run.  [2; of a .sumocfg its window]")
+@click.option("--trials", default="40", show_default=True, help="Settings that are tried beside the defaults.")
+@click.option(
+    "--over",
+    multiple=True,
+    metavar="NAME[=WHERE]",
+    help="A setting and where to search it: low:high, or values with commas, or by itself as far as it may go."
+    "  [every number that has both bounds]",
+)
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the search.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
+def tune(controller: str, over: tuple[str, ...], seed: int, out: Path | None, **flags: Any) -> None:
+    """Search settings of CONTROLLER that make least delay over nets, demands and seeds."""
+    from utn_sumo import campaign, recording, report, search_space, tuning  # noqa: PLC0415 - heavy
+
+    tuning.library()
+    space = search_space.space(controller, over)
+    demands = None if flags["demands"] is None else _numbers("demands", flags["demands"])
+    bases = tuning.bases(flags["nets"].split(","), demands, flags["hours"])
+    task = tuning.Task(controller, space, bases, campaign.seeds(flags["seeds"]))
+    task.check()
+    trials = _whole("trials", flags["trials"])
+    folder = recording.new_folder(out, f"tune-{Path(controller.partition(':')[0]).stem}")
+    with report.counter("trials", trials + 1) as tick:
+        result = tuning.tune(task, trials, seed, folder, tick)
+    report.tuning_table(result)
+    if result["interrupted"]:
+        raise KeyboardInterrupt
+
+
+@cli.command()
 @click.argument("net")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")

@@ -88,13 +88,18 @@ def _name_of(execution: Execution) -> str:
 
 
 def _built(kind: Kind, name: str, network: Network, settings: dict[str, Any]) -> Any:
-    factory = _from_file(kind, name) if ".py:" in name else _registered(kind, name)
-    if not callable(factory):
-        raise ControllerError(f"{kind.noun} {name!r} is {factory!r}: name a class")
-    found = made(name, factory, settings, network, noun=kind.noun)
+    found = made(name, maker(name, kind), settings, network, noun=kind.noun)
     if not isinstance(found, kind.contract):
         raise ControllerError(f"{kind.noun} {name!r} lacks {kind.needs}: see contract.{kind.noun.capitalize()}")
     return found
+
+
+def maker(name: str, kind: Kind = CONTROLLER) -> Callable[..., Any]:
+    """What makes the controller or execution called `name`: as a rule its class. Raises ControllerError."""
+    factory = _from_file(kind, name) if ".py:" in name else _registered(kind, name)
+    if not callable(factory):
+        raise ControllerError(f"{kind.noun} {name!r} is {factory!r}: name a class")
+    return factory  # type: ignore[no-any-return]
 
 
 def made(name: str, factory: Callable[..., T], settings: dict[str, Any], *given: Any, noun: str = CONTROLLER.noun) -> T:

@@ -270,6 +270,36 @@ def calibration_table(content: dict[str, Any]) -> None:
     console.print(view)
 
 
+def tuning_table(found: dict[str, Any]) -> None:
+    """The best settings beside the defaults, what they are worth, and how to run them."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    states = [trial["state"] for trial in found["trials"]]
+    failed = len(states) - states.count("whole") - states.count("cut")
+    console.print("{controller}: scenarios {scenarios}, seeds {seeds}".format(**found), markup=False, highlight=False)
+    console.print(f"trials {len(states) - 1}, cut short {states.count('cut')}, failed {failed}", highlight=False)
+    view = Table()
+    for head in ("setting", "default", "best"):
+        view.add_column(head, justify="left" if head == "setting" else "right")
+    best = found["best"]
+    for name, default in found["defaults"].items():
+        view.add_row(name, str(default), str(best["settings"].get(name, default)))
+    console.print(view)
+    between = "" if best["low"] is None else f" (95 % over the seeds: {best['low']:.3f} to {best['high']:.3f})"
+    console.print(f"delay over that under the defaults: {best['ratio']:.3f}{between}", highlight=False)
+    console.print("found on these seeds: judge it on others", highlight=False)
+    if best["alarms"]:
+        console.print(f"  ! {best['alarms']} unsafe seconds, fallbacks and teleports with them", highlight=False)
+    for trial in found["trials"]:
+        if trial["state"] not in {"whole", "cut"}:
+            console.print(f"  ! trial {trial['trial']}: {trial['state']}", markup=False, highlight=False)
+    if found["left"]:
+        console.print(f"not searched: {', '.join(found['left'])}", markup=False, highlight=False)
+    folder = Path(found["out"])
+    console.print(f"trials: {folder}", markup=False, highlight=False)
+    file = shlex.quote(str(folder / "best.toml"))
+    console.print(f"run it with  utn run --scenario {file}", markup=False, highlight=False, soft_wrap=True)
+
+
 def paper_table(results: list[dict[str, Any]], folder: Path) -> None:
     """The paper's table beside ours, one for each plant and demand."""
     console = Console(width=None if sys.stdout.isatty() else 140)

@@ -80,6 +80,15 @@ MISTAKES: dict[str, tuple[tuple[str, ...], str, str]] = {
         "'none'",
         "give a folder that `utn run` wrote",
     ),
+    "tuning of nobody": (("tune", "max_wav"), "'max_wav'", "did you mean 'max_wave'"),
+    "tuning over an unknown setting": (("tune", "max_wave", "--over", "evry_s=2:9"), "'evry_s'", "did you mean"),
+    "tuning over a range beyond the bounds": (
+        ("tune", "max_wave", "--over", "every_s=0:9"),
+        "'every_s=0:9'",
+        "must be",
+    ),
+    "tuning on an unknown net": (("tune", "max_wave", "--nets", "utn71"), "'utn71'", "did you mean 'utn17"),
+    "tuning with seeds in letters": (("tune", "max_wave", "--seeds", "a-b"), "'seeds' is 'a-b'", "as in 1-3,7"),
     "replay of nothing": (("replay", "none"), "'none'", "give a folder that `utn run` wrote"),
 }
 

@@ -1,0 +1,221 @@
+"""Controllers against each other: runs over nets, demands and seeds, and what they come to."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Callable, Sequence
+from concurrent.futures import as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from utn_sumo import campaign, controllers, native, streets
+from utn_sumo.case import SUFFIX
+from utn_sumo.errors import ResultError
+from utn_sumo.scenario import scenario
+
+SPENT = "total_time_spent_veh_h"
+COUNTED = ("unsafe_signal_s", "fallbacks", "teleports")
+"""Alarms: none of them may happen."""
+WAITED = "longest_red_s"
+"""Longest red while somebody waits, in the results of versions that measure it."""
+SHARE = 0.95
+KEY = ("net", "demand", "controller")
+OPENING = '{"job": '
+"""How every line of a record begins."""
+
+Job = dict[str, Any]
+Figures = dict[str, Any]
+
+
+def measure(net: str) -> str:
+    """The delay by which controllers on a net are judged: all of it, or that of a vehicle in somebody's scenario."""
+    return "mean_delay_s" if net.endswith(SUFFIX) else "total_delay_veh_h"
+
+
+def jobs(
+    nets: Sequence[str],
+    demands: Sequence[str] | None,
+    names: Sequence[str],
+    seeds: Sequence[int],
+    hours: float | None,
+) -> list[Job]:
+    """Settings of every run, checked. Without `hours` they take two, and a .sumocfg its own window.
+
+    Without `demands` it is 1.3, and a .sumocfg's own. A controller may be a TOML file that names it and its settings,
+    as `utn tune` writes. Raises UtnError.
+    """
+    chosen = {name: _controller(name) for name in names}
+    found = []
+    for net in nets:
+        streets.named(net)
+        own = net.endswith(SUFFIX)
+        lasting = {"hours": 2.0 if hours is None else hours} if not own or hours is not None else {}
+        for demand in demands or ["1.0" if own else "1.3"]:
+            for name in names:
+                shared = {"net": net, **lasting, **chosen[name]}
+                checked = [scenario(**shared, demand=demand, seed=seed) for seed in seeds]
+                found += [{**shared, "demand": each.demand, "seed": each.seed} for each in checked]
+    return found
+
+
+def _controller(name: str) -> Job:
+    """The settings of a run that say who controls it. Raises UtnError."""
+    if not name.endswith(".toml"):
+        if name != native.NAME:
+            controllers.maker(name)
+        return {"controller": name}
+    named = scenario(Path(name))
+    return {"controller": named.controller, "settings": named.settings}
+
+
+def label(job: Job) -> str:
+    """What a controller is called in figures: by its name, with the settings that it was given."""
+    given = ", ".join(f"{name}={value}" for name, value in job.get("settings", {}).items())
+    return f"{job['controller']} ({given})" if given else str(job["controller"])
+
+
+def results(wanted: Sequence[Job], workers: int | None, record: Path | None, tick: Callable[[], None]) -> list[Figures]:
+    """Measures of every run, or why it has none; what `record` has of them is not run again. Raises ResultError.
+
+    Each is a line of `record` as soon as it is there. A run that failed is tried again the next time.
+    """
+    known = {} if record is None else read(record)
+    todo = [job for job in wanted if campaign.FAILED in known.get(_key(job), {campaign.FAILED: ""})]
+    for _ in range(len(wanted) - len(todo)):
+        tick()
+    with campaign.started(workers) as start:
+        started = {start(job): job for job in todo}
+        for future in as_completed(started):
+            job, result = started[future], future.result()
+            known[_key(job)] = result
+            if record is not None:
+                with record.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"job": job, "result": result}) + "\n")
+            tick()
+    return [known[_key(job)] for job in wanted]
+
+
+def read(record: Path) -> dict[str, Figures]:
+    """Results by job from a record, the last one where there are several; a line that a halt cut short is taken off.
+
+    Raises ResultError, and leaves a file alone that is something else.
+    """
+    try:
+        record.touch()
+        text = record.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ResultError(f"record {str(record)!r} can't be used ({error}): name another with --out") from error
+    whole, _, torn = text.rpartition("\n")
+    known = {}
+    try:
+        for line in whole.splitlines():
+            entry = json.loads(line)
+            known[_key(entry["job"])] = entry["result"]
+        if not (torn.startswith(OPENING) or OPENING.startswith(torn)):
+            raise ValueError(torn)  # noqa: TRY301 - one remedy for all
+    except (ValueError, KeyError, TypeError) as error:
+        raise ResultError(f"record {str(record)!r} holds something else: name another with --out") from error
+    if torn:
+        record.write_text(whole + "\n" if whole else "", encoding="utf-8")
+    return known
+
+
+def _key(job: Job) -> str:
+    return json.dumps(job, sort_keys=True)
+
+
+def figures(wanted: Sequence[Job], found: Sequence[Figures]) -> list[Figures]:
+    """For each net, demand and controller the means and their intervals, what must not happen, and what failed.
+
+    The first controller has beside it the one of the others with the least mean delay, among those of which no run
+    failed, and the ratio of its own delay to that one's over the seeds that both have.
+    """
+    groups: dict[tuple[Any, ...], list[tuple[Job, Figures]]] = {}
+    for job, result in zip(wanted, found, strict=True):
+        groups.setdefault((job["net"], job["demand"], label(job)), []).append((job, result))
+    rows = [{**dict(zip(KEY, key, strict=True)), **_figures(key[0], runs)} for key, runs in groups.items()]
+    leader = label(wanted[0])
+    for row in rows:
+        rivals = [other for other in rows if _place(other) == _place(row) and other["controller"] != leader]
+        whole = [other for other in rivals if not other["failed"]]
+        if row["controller"] == leader and row["mean"] is not None and whole:
+            best = min(whole, key=lambda other: other["mean"])
+            its = dict(zip(best["seeds"], best["delay"], strict=True))
+            ends = ratio(row["delay"], [its[seed] for seed in row["seeds"]])
+            row |= {"best_other": best["controller"], **_named("ratio ratio_low ratio_high", ends)}
+    return rows
+
+
+def _place(row: Figures) -> tuple[str, float]:
+    return row["net"], row["demand"]
+
+
+def _figures(net: str, runs: Sequence[tuple[Job, Figures]]) -> Figures:
+    """Figures of one controller at one demand; `mean` to `median` are of the delay that `measure` names."""
+    failed = {job["seed"]: result[campaign.FAILED] for job, result in runs if campaign.FAILED in result}
+    done = [(job["seed"], result) for job, result in runs if campaign.FAILED not in result]
+    given = [result for _, result in done]
+    delay = [result[measure(net)] for result in given]
+    waited = [result[WAITED] for result in given if result.get(WAITED) is not None]
+    sumo_s = sum(result["sumo_time_s"] for result in given)
+    return {
+        "measure": measure(net),
+        "seeds": [seed for seed, _ in done],
+        "delay": delay,
+        **_named("mean low high", interval(delay)),
+        "median": statistics.median(delay) if delay else None,
+        SPENT: [result[SPENT] for result in given],
+        **_named("spent_mean spent_low spent_high", interval([result[SPENT] for result in given])),
+        "gridlocked": _sum([result["gridlock"] for result in given]),
+        **{name: _sum([result[name] for result in given]) for name in COUNTED},
+        "unfinished": [result["unfinished"] for result in given],
+        "control_over_sumo": sum(result["control_time_s"] for result in given) / sumo_s if sumo_s else None,
+        **({WAITED: max(waited)} if waited else {}),
+        "left_alone": given[0]["left_alone"] if given else {},
+        "fallback_reasons": [reason for result in given for reason in result["fallback_reasons"]],
+        "failed": failed,
+    }
+
+
+def _named(names: str, values: Sequence[float | None]) -> Figures:
+    return dict(zip(names.split(), values, strict=True))
+
+
+def _sum(counts: Sequence[int | None]) -> int | None:
+    """None where one of them is not known, as under signals that nobody judges."""
+    known = [count for count in counts if count is not None]
+    return sum(known) if known and len(known) == len(counts) else None
+
+
+def interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
+    """Mean of runs over seeds, and the ends of Student's interval for it; None where there are too few."""
+    if not values:
+        return None, None, None
+    mean = statistics.mean(values)
+    if len(values) == 1:
+        return mean, None, None
+    half = float(stats.t.ppf((1 + SHARE) / 2, len(values) - 1)) * statistics.stdev(values) / len(values) ** 0.5
+    return mean, mean - half, mean + half
+
+
+def ratio(mine: Sequence[float], others: Sequence[float]) -> tuple[float | None, float | None, float | None]:
+    """Ratio of the means of runs that belong together, and Fieller's interval for it.
+
+    None where there are too few, or where the other mean may be 0 so that the interval has no ends.
+    """
+    a, b, n = statistics.mean(mine), statistics.mean(others), len(mine)
+    if not b:
+        return None, None, None
+    if n == 1:
+        return a / b, None, None
+    # All r for which the mean of mine - r * others is within its own interval about 0: a quadratic in r.
+    (aa, ab), (_, bb) = np.cov(mine, others) * float(stats.t.ppf((1 + SHARE) / 2, n - 1)) ** 2 / n
+    lead = b * b - bb
+    if lead <= 0:
+        return a / b, None, None
+    middle, half = (a * b - ab) / lead, max((a * b - ab) ** 2 - lead * (a * a - aa), 0.0) ** 0.5 / lead
+    return a / b, float(middle - half), float(middle + half)
