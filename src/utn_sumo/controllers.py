@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -140,13 +141,17 @@ def _registered(kind: Kind, name: str) -> Any:
 
 def _from_file(kind: Kind, name: str) -> Any:
     path, _, attribute = name.rpartition(":")
-    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
+    # A name that no other module has, whatever theirs is called.
+    spec = importlib.util.spec_from_file_location(str(Path(path).resolve()).replace(".", "_"), path)
     if spec is None or spec.loader is None or not Path(path).is_file():
         raise ControllerError(f"{kind.noun} {name!r}: there is no file {path!r}")
     module = importlib.util.module_from_spec(spec)
+    # Annotations that are text are looked up there, by pydantic and dataclasses.
+    sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
     except Exception as error:
+        del sys.modules[spec.name]
         raise ControllerError(f"{kind.noun} {name!r}: {path!r} can't be loaded: {_told(error)}") from error
     if not hasattr(module, attribute):
         raise ControllerError(f"{kind.noun} {name!r}: {path!r} has no class {attribute!r}")

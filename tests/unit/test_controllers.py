@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -143,3 +144,46 @@ def test_a_class_that_can_not_be_built_is_refused_in_one_line(utn17: Network, ow
 def test_a_file_that_does_not_import_is_refused_in_one_line(utn17: Network, own: Path, content: str) -> None:
     own.write_text(content, encoding="utf-8")
     assert "own.py" in complaint(utn17, f"{own}:Mine")
+
+
+ANNOTATED = """
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from pydantic import BaseModel
+
+class MineSettings(BaseModel):
+    cost: Literal["tts", "paper"] = "tts"
+
+@dataclass
+class Part:
+    many: ClassVar[int] = 2
+    one: int = 1
+
+class Mine:
+    Settings = MineSettings
+    horizon = 3
+    def __init__(self, network, **settings):
+        self.network, self.cost, self.part = network, MineSettings(**settings).cost, Part(4)
+    def plan(self, state, forecast):
+        return self.network.equal_split()
+"""
+
+
+def test_a_file_may_put_off_its_annotations(tmp_path: Path, utn17: Network) -> None:
+    path = tmp_path / "json.py"
+    path.write_text(ANNOTATED, encoding="utf-8")
+    mine: Any = controllers.build(f"{path}:Mine", utn17, {"cost": "paper"})
+    assert (mine.cost, mine.part.one) == ("paper", 4)
+    assert "must be 'tts' or 'paper'" in complaint(utn17, f"{path}:Mine", SettingError, cost="money")
+    assert sys.modules["json"].loads("1") == 1
+
+
+def test_of_a_file_that_can_not_be_loaded_nothing_is_left(tmp_path: Path, utn17: Network) -> None:
+    path = tmp_path / "own.py"
+    path.write_text("raise RuntimeError('not today')", encoding="utf-8")
+    before = set(sys.modules)
+    assert "can't be loaded: RuntimeError: not today" in complaint(utn17, f"{path}:Mine")
+    assert set(sys.modules) == before
