@@ -133,7 +133,7 @@ def _text(value: Any) -> str:
 @bench.command()
 @click.option("--nets", default=("utn17",), multiple=True, help="Shipped nets, nets, .sumocfg files.  [utn17]")
 @click.option("--hours", type=float, help="Simulated hours of each run.  [2; of a .sumocfg its window]")
-@click.option("--controllers", default="dmpc,fixed", show_default=True, help="Or files as `utn tune` writes them.")
+@click.option("--controllers", default="dmpc,fixed", show_default=True, help="CONTROLLER/EXECUTION too, and best.toml.")
 @click.option("--demands", help="Demands.  [1.3; of a .sumocfg 1.0]")
 @click.option("--seeds", default="1-5", show_default=True, help="Numbers and ranges.")
 @click.option("--workers", type=click.IntRange(1), help="Runs at the same time.  [one a processor]")

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from utn_sumo import campaign, controllers, native, streets
+from utn_sumo import bridge, campaign, controllers, native, streets
 from utn_sumo.case import SUFFIX
 from utn_sumo.errors import ResultError
-from utn_sumo.scenario import scenario
+from utn_sumo.scenario import EXACT, flat, scenario
 
 SPENT = "total_time_spent_veh_h"
 COUNTED = ("unsafe_signal_s", "fallbacks", "teleports")
 """Alarms: none of them may happen."""
 WAITED = "longest_red_s"
-"""Longest red while somebody waits, in the results of versions that measure it."""
+"""Longest red while somebody waits; not known of signals that SUMO switches."""
 SHARE = 0.95
 KEY = ("net", "demand", "controller")
 OPENING = '{"job": '
@@ -45,8 +45,8 @@ def jobs(
 ) -> list[Job]:
     """Settings of every run, checked. Without `hours` they take two, and a .sumocfg its own window.
 
-    Without `demands` it is 1.3, and a .sumocfg's own. A controller may be a TOML file that names it and its settings,
-    as `utn tune` writes. Raises UtnError.
+    Without `demands` it is 1.3, and a .sumocfg's own. A controller may be followed by the execution of its plans, as in
+    dmpc/actuated, or be a TOML file that names it and its settings, as `utn tune` writes. Raises UtnError.
     """
     chosen = {name: _controller(name) for name in names}
     found = []
@@ -64,18 +64,32 @@ def jobs(
 
 def _controller(name: str) -> Job:
     """The settings of a run that say who controls it. Raises UtnError."""
-    if not name.endswith(".toml"):
-        if name != native.NAME:
-            controllers.maker(name)
-        return {"controller": name}
-    named = scenario(Path(name))
-    return {"controller": named.controller, "settings": named.settings}
+    whole = name.endswith(".toml")
+    named = scenario(Path(name)) if whole else scenario(**_spelt(name))
+    bridge.check_execution(named)
+    if named.controller != native.NAME:
+        controllers.maker(named.controller)
+    if named.execution not in {None, EXACT}:
+        controllers.maker(str(named.execution), controllers.EXECUTION)
+    told = {"controller", "execution"} | ({"settings"} if whole else set())
+    return named.model_dump(include=told, exclude_none=True)
+
+
+def _spelt(name: str) -> dict[str, Any]:
+    """Controller, and execution if there is one, from CONTROLLER/EXECUTION; either may be path.py:Class."""
+    controller, slash, execution = name.partition("/")
+    if ".py:" in name and controller not in controllers.registered():
+        path, colon, rest = name.partition(".py:")
+        own, slash, execution = rest.partition("/")
+        controller = path + colon + own
+    return {"controller": controller, **({"execution": execution} if slash else {})}
 
 
 def label(job: Job) -> str:
-    """What a controller is called in figures: by its name, with the settings that it was given."""
-    given = ", ".join(f"{name}={value}" for name, value in job.get("settings", {}).items())
-    return f"{job['controller']} ({given})" if given else str(job["controller"])
+    """What a controller is called in figures: by its name, with its execution's and the settings that it was given."""
+    given = ", ".join(f"{name}={value}" for name, value in flat(job.get("settings", {})).items())
+    name = "/".join(job[each] for each in ("controller", "execution") if each in job)
+    return f"{name} ({given})" if given else name
 
 
 def results(wanted: Sequence[Job], workers: int | None, record: Path | None, tick: Callable[[], None]) -> list[Figures]:

@@ -59,8 +59,8 @@ def run(
 
     A KeyboardInterrupt ends the run early with a whole, readable result that says so. Raises UtnError.
     """
+    check_execution(scenario)
     if alone := sumo_signals.RUNS.get(scenario.controller):
-        _refuse_execution(scenario)
         return alone(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
     chosen = traffic.given(scenario) if scenario.net.endswith(SUFFIX) else None
     net = streets.named(scenario.net) if chosen is None else streets.controllable(chosen)
@@ -176,9 +176,9 @@ def _predictor(net: Network, scenario: Scenario, driving: Path | Case, steps: in
     )
 
 
-def _refuse_execution(scenario: Scenario) -> None:
+def check_execution(scenario: Scenario) -> None:
     """Raise SettingError for an execution beside signals that SUMO switches itself."""
-    if scenario.execution is not None:
+    if scenario.execution is not None and scenario.controller in sumo_signals.RUNS:
         raise SettingError(
             f"setting 'execution' is {scenario.execution!r}: controller {scenario.controller!r} plans nothing that "
             "could be carried out, SUMO switches its signals: leave it out"

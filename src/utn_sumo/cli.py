@@ -52,28 +52,21 @@ def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bo
     CASE is a .sumocfg of your own, with net and demand.
     """
     from utn_sumo import bridge, report  # noqa: PLC0415 - heavy
-    from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy
+    from utn_sumo.scenario import nested, scenario  # noqa: PLC0415 - heavy
 
     named = {name: flags.pop(name) for name in ("horizon", "control_horizon", "cost")}
     settings: dict[str, Any] = {name: _number(value) for name, value in named.items() if value is not None}
-    of_execution: dict[str, Any] = {}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals:
             raise SettingError(f"--set {pair!r}: write it as NAME=VALUE")
-        owner, dot, rest = name.strip().partition(".")
-        if dot and owner == "execution":
-            of_execution[rest] = _number(value.strip())
-        else:
-            settings[name.strip()] = _number(value.strip())
-    if of_execution:
-        settings["execution"] = of_execution
+        settings[name.strip()] = _number(value.strip())
     own = flags.pop("case")
     if own is not None and flags["net"] is not None:
         raise SettingError(f"setting 'net' is {flags['net']!r}, beside {own!r}: give one of them")
     flags["net"] = flags["net"] or own
     given: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
-    chosen = scenario(file, settings=settings, **given)
+    chosen = scenario(file, settings=nested(settings), **given)
     with report.progress(chosen) as on_cycle:
         result = bridge.run(chosen, out, on_cycle)
     click.echo(json.dumps(result)) if as_json else report.table(result)
@@ -221,6 +214,7 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
 
 @cli.command()
 @click.argument("controller")
+@click.option("--execution", help="How its plans are carried out: exact, registered, path.py:Class.  [its own way]")
 @click.option("--nets", default="utn17", show_default=True, help="Shipped nets, nets, .sumocfg files, with commas.")
 @click.option("--demands", help="Demands, separated by commas.  [0.6,1.0,1.3; of a .sumocfg 1.0]")
 @click.option("--seeds", default="1-3", show_default=True, help="Numbers and ranges, separated by commas.")
@@ -230,23 +224,27 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
     "--over",
     multiple=True,
     metavar="NAME[=WHERE]",
-    help="A setting and where to search it: low:high, or values with commas, or by itself as far as it may go."
+    help="A setting and where to search it: low:high, or values with commas, or by itself as far as it may go;"
+    " execution.NAME of the execution."
     "  [every number that has both bounds]",
 )
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the search.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
-def tune(controller: str, over: tuple[str, ...], seed: int, out: Path | None, **flags: Any) -> None:
+def tune(
+    controller: str, execution: str | None, over: tuple[str, ...], seed: int, out: Path | None, **flags: Any
+) -> None:
     """Search settings of CONTROLLER that make least delay over nets, demands and seeds."""
     from utn_sumo import campaign, recording, report, search_space, tuning  # noqa: PLC0415 - heavy
 
     tuning.library()
-    space = search_space.space(controller, over)
+    space = search_space.space(controller, over, execution)
     demands = None if flags["demands"] is None else _numbers("demands", flags["demands"])
     bases = tuning.bases(flags["nets"].split(","), demands, flags["hours"])
-    task = tuning.Task(controller, space, bases, campaign.seeds(flags["seeds"]))
+    task = tuning.Task(controller, space, bases, campaign.seeds(flags["seeds"]), execution)
     task.check()
     trials = _whole("trials", flags["trials"])
-    folder = recording.new_folder(out, f"tune-{Path(controller.partition(':')[0]).stem}")
+    names = "-".join(Path(each.partition(":")[0]).stem for each in task.who.values())
+    folder = recording.new_folder(out, f"tune-{names}")
     with report.counter("trials", trials + 1) as tick:
         result = tuning.tune(task, trials, seed, folder, tick)
     report.tuning_table(result)

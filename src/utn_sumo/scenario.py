@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +13,8 @@ from utn_sumo.errors import SettingError, did_you_mean
 
 EXACT = "exact"
 """The execution that shows a plan's greens to the second."""
+OF_EXECUTION = "execution."
+"""How the names of an execution's settings begin where they stand beside the controller's."""
 
 
 class Scenario(BaseModel):
@@ -97,6 +99,22 @@ def scenario(file: Path | None = None, **given: Any) -> Scenario:
         return Scenario(**{**values, **given, "settings": settings})
     except ValidationError as error:
         raise SettingError(explain(error, Scenario.model_fields)) from error
+
+
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as a scenario has them, from a flat table in which those of the execution are called execution.NAME."""
+    found = {name: value for name, value in settings.items() if not name.startswith(OF_EXECUTION)}
+    inner = {name.removeprefix(OF_EXECUTION): value for name, value in settings.items() if name not in found}
+    return {**found, "execution": inner} if inner else found
+
+
+def flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The flat table of settings that a scenario has."""
+    inner = settings.get("execution")
+    if not isinstance(inner, dict):
+        return dict(settings)
+    own = {name: value for name, value in settings.items() if name != "execution"}
+    return own | {OF_EXECUTION + name: value for name, value in inner.items()}
 
 
 def explain(error: ValidationError, known: Iterable[str]) -> str:

@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
-from utn_sumo import controllers
+from utn_sumo.controllers import CONTROLLER, EXECUTION, Kind, maker
 from utn_sumo.errors import SettingError, did_you_mean
-from utn_sumo.scenario import explain
+from utn_sumo.scenario import EXACT, OF_EXECUTION, explain
 
 WIDE = 100
 """From so many times its low end on a range is searched by its logarithm."""
@@ -22,6 +22,7 @@ INSIDE = 1e-3
 """How far within a bound that is itself excluded a search begins, as a share of the range."""
 
 Settings = dict[str, Any]
+"""By name; those of an execution are called execution.NAME."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,10 @@ class Choice:
 
 @dataclass(frozen=True)
 class Space:
-    """What is searched of a controller's settings."""
+    """What is searched of the settings of a controller, and of the execution beside it if there is one."""
 
-    model: type[BaseModel]
+    models: Mapping[str, type[BaseModel]]
+    """By how the names of their settings begin."""
     searched: Mapping[str, Range | Choice]
 
     @property
@@ -84,23 +86,26 @@ class Space:
     @property
     def defaults(self) -> Settings:
         """What the searched settings are when nobody sets them."""
-        return {name: self.model.model_fields[name].get_default() for name in self.searched}
+        fields = _fields(self.models)
+        return {name: fields[name].get_default() for name in self.searched}
 
     @property
     def left(self) -> list[str]:
         """Settings that stay as they are."""
-        return [name for name in self.model.model_fields if name not in self.searched]
+        return [name for name in _fields(self.models) if name not in self.searched]
 
     def settings(self, proposed: Mapping[str, Any]) -> Settings:
         """Settings from optuna's parameters."""
         return {name: each.setting(proposed[name]) for name, each in self.searched.items()}
 
     def refusal(self, settings: Settings) -> str | None:
-        """Why the controller does not take settings together, if it does not."""
-        try:
-            self.model(**settings)
-        except ValidationError as error:
-            return explain(error, self.model.model_fields)
+        """Why controller or execution do not take settings together, if they do not."""
+        for prefix, model in self.models.items():
+            own = {name: settings[prefix + name] for name in model.model_fields if prefix + name in settings}
+            try:
+                model(**own)
+            except ValidationError as error:
+                return explain(error, model.model_fields)
         return None
 
     def tell_defaults(self, study: Any) -> None:
@@ -112,36 +117,52 @@ class Space:
             study.add_trial(trial.create_trial(**known, value=0.0, intermediate_values={0: 0.0}))
 
 
-def space(controller: str, over: Sequence[str] = ()) -> Space:
+def space(controller: str, over: Sequence[str] = (), execution: str | None = None) -> Space:
     """Where the settings of a controller are searched: those named in `over`, else all numbers that have both bounds.
 
-    A setting is named as `name=low:high`, as `name=value,value,...`, or alone, for its own range or choices. Raises
-    UtnError.
+    A setting is named as `name=low:high`, as `name=value,value,...`, or alone, for its own range or choices; those of
+    an execution likewise, as `execution.name`. Raises UtnError.
     """
-    maker = controllers.maker(controller)
-    model = getattr(maker, "Settings", maker)
-    if not (isinstance(model, type) and issubclass(model, BaseModel) and model.model_fields):
-        raise SettingError(f"controller {controller!r} has no pydantic `Settings`: there is nothing to search")
-    fields = model.model_fields
+    whose = f"controller {controller!r}"
+    models = _model(CONTROLLER, controller, "")
+    if execution is not None and execution != EXACT:
+        whose += f" with execution {execution!r}"
+        models |= _model(EXECUTION, execution, OF_EXECUTION)
+    fields = _fields(models)
+    if not fields:
+        raise SettingError(f"{whose} has no pydantic `Settings`: there is nothing to search")
     if not over:
         own = {name: _own(each) for name, each in fields.items()}
         ranges = {name: each for name, each in own.items() if isinstance(each, Range)}
         if not ranges:
+            name, first = next(iter(own.items()))
             raise SettingError(
-                f"controller {controller!r}: none of its settings ({', '.join(fields)}) is a number with both bounds: "
-                f"say where to search, as in --over {next(iter(fields))}=1:10"
+                f"{whose}: none of its settings ({', '.join(fields)}) is a number with both bounds: "
+                f"say where to search, as in --over {name}{'' if first else '=1:10'}"
             )
-        return Space(model, ranges)
+        return Space(models, ranges)
     searched = {}
     for text in over:
         name, equals, where = (word.strip() for word in text.partition("="))
         if name not in fields:
-            raise SettingError(f"controller {controller!r} has no setting {name!r}: {did_you_mean(name, fields)}")
+            raise SettingError(f"{whose} has no setting {name!r}: {did_you_mean(name, fields)}")
         found = _said(text, fields[name], where) if equals else _own(fields[name])
         if found is None:
             raise SettingError(f"--over {text!r}: it has no bounds of its own, write {name}=low:high or {name}=a,b,c")
         searched[name] = found
-    return Space(model, searched)
+    return Space(models, searched)
+
+
+def _model(kind: Kind, name: str, prefix: str) -> dict[str, type[BaseModel]]:
+    """The model of somebody's settings, if they have one, by how their names begin. Raises ControllerError."""
+    made_by = maker(name, kind)
+    model = getattr(made_by, "Settings", made_by)
+    return {prefix: model} if isinstance(model, type) and issubclass(model, BaseModel) else {}
+
+
+def _fields(models: Mapping[str, type[BaseModel]]) -> dict[str, FieldInfo]:
+    """All settings by name."""
+    return {prefix + name: field for prefix, model in models.items() for name, field in model.model_fields.items()}
 
 
 def _kind(field: FieldInfo) -> Any:

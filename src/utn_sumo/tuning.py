@@ -23,11 +23,11 @@ from typing import Any
 
 from scipy import stats
 
-from utn_sumo import campaign, streets
+from utn_sumo import bridge, campaign, streets
 from utn_sumo.campaign import FAILED
 from utn_sumo.case import SUFFIX
 from utn_sumo.errors import SettingError, UtnError
-from utn_sumo.scenario import scenario
+from utn_sumo.scenario import nested, scenario
 from utn_sumo.search_space import Settings, Space
 
 TRIALS, TABLE, BEST = "trials.jsonl", "trials.csv", "best.toml"
@@ -78,16 +78,22 @@ class Task:
     bases: Sequence[Mapping[str, Any]]
     """Net, demand and duration of each scenario, as `scenario` takes them."""
     seeds: Sequence[int]
+    execution: str | None = None
+
+    @property
+    def who(self) -> dict[str, Any]:
+        """The settings of a run that say who controls it."""
+        return {"controller": self.controller} | ({} if self.execution is None else {"execution": self.execution})
 
     def check(self) -> None:
         """Raises UtnError for a scenario that can't be."""
         for base in self.bases:
             for seed in self.seeds:
-                scenario(**base, controller=self.controller, seed=seed)
+                bridge.check_execution(scenario(**base, **self.who, seed=seed))
 
     def runs(self, start: Start, settings: Settings, seed: int) -> list[Future[dict[str, Any]]]:
         """A run of every scenario with a seed."""
-        own = {"controller": self.controller, "settings": settings, "seed": seed}
+        own = {**self.who, "settings": nested(settings), "seed": seed}
         return [start({**base, **own}) for base in self.bases]
 
 
@@ -133,7 +139,7 @@ def tune(task: Task, trials: int, seed: int, folder: Path, tick: Callable[[], No
     ratio, low, high = over_defaults(found)
     _write_table(folder / TABLE, task, tried)
     return {
-        "controller": task.controller,
+        "controller": "/".join(task.who.values()),
         "scenarios": len(task.bases),
         "seeds": len(task.seeds),
         "trials": [trial.record() for trial in tried],
@@ -178,7 +184,7 @@ def toml(task: Task, trial: Trial) -> str:
     lines = [
         f"# Trial {trial.number} of utn tune: {math.exp(trial.value):.3f} times the delay under the defaults.",
         f"# Nets {json.dumps(nets)[1:-1]}; demands {demands}; seeds {seeds}.",
-        f"controller = {json.dumps(task.controller)}",
+        *(f"{name} = {json.dumps(value)}" for name, value in task.who.items()),
         "",
         "[settings]",
         *(f"{name} = {json.dumps(value)}" for name, value in trial.settings.items() if value is not None),
@@ -194,7 +200,7 @@ def _judged(task: Task, study: Any, trials: int, start: Start) -> Iterator[Trial
     for seed, futures in runs.items():
         default_h[seed] = _delays_h(futures, defaults)
         if defaults.state != WHOLE:
-            raise UtnError(f"{task.controller} fails with its defaults: {defaults.state}")
+            raise UtnError(f"{'/'.join(task.who.values())} fails with its defaults: {defaults.state}")
         defaults.logs[seed] = [0.0] * len(futures)
     task.space.tell_defaults(study)
     yield defaults

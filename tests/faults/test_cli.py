@@ -87,6 +87,12 @@ MISTAKES: dict[str, tuple[tuple[str, ...], str, str]] = {
         "'every_s=0:9'",
         "must be",
     ),
+    "tuning with an unknown execution": (("tune", "dmpc", "--execution", "actuatd"), "'actuatd'", "'actuated'"),
+    "tuning with an execution beside SUMO's own signals": (
+        ("tune", "actuated", "--execution", "actuated"),
+        "'execution' is 'actuated'",
+        "leave it out",
+    ),
     "tuning on an unknown net": (("tune", "max_wave", "--nets", "utn71"), "'utn71'", "did you mean 'utn17"),
     "tuning with seeds in letters": (("tune", "max_wave", "--seeds", "a-b"), "'seeds' is 'a-b'", "as in 1-3,7"),
     "replay of nothing": (("replay", "none"), "'none'", "give a folder that `utn run` wrote"),

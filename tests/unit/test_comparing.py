@@ -148,9 +148,46 @@ def test_demands_and_hours_have_their_defaults_by_net_and_settings_may_come_from
 
 
 @pytest.mark.parametrize(
+    ("name", "controller", "execution"),
+    [
+        ("dmpc", "dmpc", None),
+        ("dmpc/actuated", "dmpc", "actuated"),
+        ("fixed/exact", "fixed", "exact"),
+        ("webster+offsets", "webster+offsets", None),
+        ("FILE:Own", "FILE:Own", None),
+        ("FILE:Own/priced", "FILE:Own", "priced"),
+        ("fixed/FILE:Own", "fixed", "FILE:Own"),
+        ("FILE:Own/FILE:Own", "FILE:Own", "FILE:Own"),
+    ],
+)
+def test_a_controller_may_be_followed_by_its_execution(
+    tmp_path: Path, name: str, controller: str, execution: str | None
+) -> None:
+    file = tmp_path / "own.py"
+    file.write_text("class Own:\n    pass\n", encoding="utf-8")
+    name, controller, known = (str(each).replace("FILE", str(file)) for each in (name, controller, execution))
+    (job,) = comparing.jobs(["utn17"], None, [name], [1], None)
+    assert (job["controller"], str(job.get("execution"))) == (controller, known)
+    assert comparing.label(job) == name
+
+
+def test_a_file_s_execution_and_its_settings_are_kept_and_told(tmp_path: Path) -> None:
+    file = tmp_path / "best.toml"
+    lines = ['controller = "dmpc"', 'execution = "actuated"', "[settings]", "rho = 0.3", "execution.gap_s = 3.0"]
+    file.write_text("\n".join(lines), encoding="utf-8")
+    (job,) = comparing.jobs(["utn17"], None, [str(file)], [1], None)
+    assert job["settings"] == {"rho": 0.3, "execution": {"gap_s": 3.0}}
+    assert comparing.label(job) == "dmpc/actuated (rho=0.3, execution.gap_s=3.0)"
+
+
+@pytest.mark.parametrize(
     ("given", "named"),
     [
         ({"names": ["fxed"]}, "'fxed'"),
+        ({"names": ["fxed/actuated"]}, "controller 'fxed'"),
+        ({"names": ["fixed/actuatd"]}, "execution 'actuatd'"),
+        ({"names": ["fixed/"]}, "execution ''"),
+        ({"names": ["native/actuated"]}, "leave it out"),
         ({"nets": ["utn71"]}, "'utn71'"),
         ({"demands": ["much"]}, "'much'"),
         ({"hours": 0.0}, "'hours' is 0.0"),

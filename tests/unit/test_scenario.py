@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from utn_sumo.errors import SettingError
-from utn_sumo.scenario import Scenario, scenario
+from utn_sumo.scenario import Scenario, flat, nested, scenario
 
 
 def complaint(file: Path | None = None, **given: Any) -> str:
@@ -54,6 +54,15 @@ def test_an_unknown_setting_is_answered_with_the_nearest_known_one() -> None:
 
 def test_a_run_too_short_to_last_a_second_is_refused() -> None:
     assert "hours" in complaint(hours=1e-4)
+
+
+def test_settings_of_an_execution_are_a_table_of_their_own_or_named_as_its() -> None:
+    table = {"rho": 0.3, "execution.gap_s": 3.0}
+    chosen = scenario(execution="actuated", settings=nested(table))
+    assert chosen.controller_settings == {"rho": 0.3}
+    assert chosen.execution_settings == {"gap_s": 3.0}
+    assert flat(chosen.settings) == table
+    assert nested({"rho": 0.3}) == {"rho": 0.3}
 
 
 def test_numbers_may_come_as_text_from_a_command_line() -> None:

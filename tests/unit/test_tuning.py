@@ -56,9 +56,9 @@ def valley(job: dict[str, Any]) -> float:
     return float(job["demand"] * (1 + job["seed"] / 10) * (100 + (every_s - 20) ** 2))
 
 
-def task(controller: str = "max_wave", over: tuple[str, ...] = (), seeds: tuple[int, ...] = (1, 2, 3)) -> tuning.Task:
+def task(controller: str = "max_wave", over: tuple[str, ...] = (), execution: str | None = None) -> tuning.Task:
     bases = [{"net": "utn17", "demand": demand, "hours": 2.0} for demand in (0.6, 1.3)]
-    return tuning.Task(controller, space(controller, over), bases, seeds)
+    return tuning.Task(controller, space(controller, over, execution), bases, (1, 2, 3), execution)
 
 
 def tune(folder: Path, wanted: tuning.Task, trials: int = 20, seed: int = 1) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def test_where_a_setting_is_searched(controller: str, over: str, known: Range | 
     name = over.partition("=")[0]
     (found,) = space(controller, [over]).searched.values()
     assert found == known
-    model = space(controller, [over]).model
+    model = space(controller, [over]).models[""]
     ends = found.values if isinstance(found, Choice) else (found.low, found.high)
     for value in ends:
         assert getattr(model(**{name: value}), name) == value
@@ -96,6 +96,12 @@ def test_without_a_word_all_numbers_with_both_bounds_are_searched() -> None:
     assert set(space("actuated").searched) == {"min_green_s", "max_green_s", "max_gap_s", "detector_gap_s"}
     assert set(space("priced").searched) == {"every_s"}
     assert space("max_pressure").left == ["count", "per"]
+    assert space("fixed", execution="actuated").searched == {"execution.gap_s": Range(0.06, 60, whole=False)}
+    both = space("dmpc", ("relaxation", "execution.gap_s=1:4"), "actuated")
+    assert both.defaults == {"relaxation": 1.6, "execution.gap_s": 2.0}
+    assert "horizon" in both.left
+    assert both.refusal({"relaxation": 1.5, "execution.gap_s": 3.0}) is None
+    assert "'gap_s' is 0" in str(both.refusal({"execution.gap_s": 0.0}))
 
 
 @pytest.mark.parametrize(
@@ -103,6 +109,8 @@ def test_without_a_word_all_numbers_with_both_bounds_are_searched() -> None:
     [
         ("max_wav", (), "did you mean 'max_wave'"),
         ("fixed", (), "has no pydantic `Settings`"),
+        ("cyclic_max_pressure", (), "is a number with both bounds: say where to search, as in --over count"),
+        ("dmpc", ("execution.gap_s=1:3",), "has no setting 'execution.gap_s'"),
         ("max_wave", ("evry_s=1:2",), "did you mean 'every_s'"),
         ("max_wave", ("every_s=0:2",), "greater than or equal to 1"),
         ("max_wave", ("every_s=9:2",), "low:high"),
@@ -122,7 +130,7 @@ def test_a_range_that_can_not_be_searched_is_one_line(controller: str, over: tup
 
 
 def test_without_bounds_the_settings_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    unbounded = space("priced").model
+    unbounded = space("priced").models[""]
     monkeypatch.delitem(unbounded.model_fields, "every_s")
     with pytest.raises(SettingError, match=r"horizon_s, crowding, full.*--over horizon_s=1:10"):
         space("priced")
@@ -168,7 +176,20 @@ def test_the_best_can_be_run(tmp_path: Path, plant: Any, controller: str) -> Non
     read = scenario(tmp_path / "out" / tuning.BEST)
     assert read.controller == controller
     assert read.settings == {name: value for name, value in found["best"]["settings"].items() if value is not None}
-    space(controller).model(**read.settings)
+    space(controller).models[""](**read.settings)
+
+
+def test_an_execution_and_its_settings_go_with_every_run_and_into_the_best(tmp_path: Path, plant: Any) -> None:
+    begun = plant(lambda job: 50.0 if job["settings"] else 100.0)
+    over = ("rho=0.1:1", "execution.gap_s=1:4")
+    found = tune(tmp_path / "out", task("dmpc", over, "actuated"), trials=3)
+    assert found["controller"] == "dmpc/actuated"
+    assert {job["execution"] for job in begun} == {"actuated"}
+    assert all(job["settings"].keys() in ({"rho", "execution"}, set()) for job in begun)
+    read = scenario(tmp_path / "out" / tuning.BEST)
+    assert (read.controller, read.execution) == ("dmpc", "actuated")
+    assert read.controller_settings == {"rho": found["best"]["settings"]["rho"]}
+    assert read.execution_settings == {"gap_s": found["best"]["settings"]["execution.gap_s"]}
 
 
 def test_where_nothing_is_better_the_defaults_are_the_best(tmp_path: Path, plant: Any) -> None:
@@ -217,5 +238,8 @@ def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.Monkey
 
 
 def test_every_registered_controller_with_ranges_can_be_tuned() -> None:
-    names = [name for name in controllers.registered() if name != "fixed"]
+    choices = ("proportional", "cyclic_max_pressure")
+    names = [name for name in controllers.registered() if name not in {"fixed", *choices}]
     assert all(space(name).distributions for name in names)
+    assert all(space(name, ["count"]).distributions for name in choices)
+    assert all(space("fixed", (), name).distributions for name in controllers.registered(controllers.EXECUTION))
