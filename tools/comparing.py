@@ -59,19 +59,19 @@ def jobs(
                 shared = {"net": net, **lasting, **chosen[name]}
                 checked = [scenario(**shared, demand=demand, seed=seed) for seed in seeds]
                 found += [{**shared, "demand": each.demand, "seed": each.seed} for each in checked]
-    return found
+    # Runs that are the same would pass for runs that agree.
+    return list({_key(job): job for job in found}.values())
 
 
 def _controller(name: str) -> Job:
     """The settings of a run that say who controls it. Raises UtnError."""
-    whole = name.endswith(".toml")
-    named = scenario(Path(name)) if whole else scenario(**_spelt(name))
+    named = scenario(Path(name)) if name.endswith(".toml") else scenario(**_spelt(name))
     bridge.check_execution(named)
     if named.controller != native.NAME:
         controllers.maker(named.controller)
     if named.execution not in {None, EXACT}:
         controllers.maker(str(named.execution), controllers.EXECUTION)
-    told = {"controller", "execution"} | ({"settings"} if whole else set())
+    told = {"controller", "execution"} | ({"settings"} if named.settings else set())
     return named.model_dump(include=told, exclude_none=True)
 
 

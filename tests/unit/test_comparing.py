@@ -171,6 +171,13 @@ def test_a_controller_may_be_followed_by_its_execution(
     assert comparing.label(job) == name
 
 
+def test_what_is_named_twice_is_run_and_counted_once(tmp_path: Path) -> None:
+    file = tmp_path / "best.toml"
+    file.write_text('controller = "dmpc"\n[settings]\n', encoding="utf-8")
+    jobs = comparing.jobs(["utn17"], ["1", "1.0"], ["dmpc", "fixed", str(file), "dmpc"], [1, 2], None)
+    assert [(job["controller"], job["seed"]) for job in jobs] == [("dmpc", 1), ("dmpc", 2), ("fixed", 1), ("fixed", 2)]
+
+
 def test_a_file_s_execution_and_its_settings_are_kept_and_told(tmp_path: Path) -> None:
     file = tmp_path / "best.toml"
     lines = ['controller = "dmpc"', 'execution = "actuated"', "[settings]", "rho = 0.3", "execution.gap_s = 3.0"]
