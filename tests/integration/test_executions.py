@@ -57,7 +57,7 @@ def own(tmp_path: Path) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("controller", ["fixed", "dmpc", "cmpc", "priced"])
+@pytest.mark.parametrize("controller", ["fixed", "dmpc", "cmpc", "tuc", "priced"])
 @pytest.mark.parametrize("execution", ["exact", *registered(EXECUTION)])
 def test_any_planner_runs_with_any_execution(run_of: Run, controller: str, execution: str) -> None:
     result, folder = run_of(controller=controller, execution=execution, hours=0.2)
