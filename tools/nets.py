@@ -74,7 +74,9 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
                     turns.append(Turn(link, to_edge, next_link, share, (), link))
                 letters = "".join("G" if other == position else "r" for other in range(len(here)) for _ in range(2))
                 clearance = ((letters.replace("G", "y"), YELLOW_S), ("r" * len(letters), ALL_RED_S))
-                stages.append(Stage(row * columns + column, letters, clearance, tuple(served), MIN_GREEN_S))
+                stages.append(
+                    Stage(row * columns + column, letters, clearance, tuple(served), MIN_GREEN_S, MIN_GREEN_S)
+                )
             count = len(turns) - first_turn
             junctions.append(
                 Junction(

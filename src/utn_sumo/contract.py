@@ -24,6 +24,8 @@ Bools = npt.NDArray[np.bool_]
 EXIT = -1
 MOST_CYCLES = 3
 """Longest cycles between two decisions that junctions with different cycles make necessary."""
+AREA_REACH_M = 200.0
+"""Lane-area detectors see this far upstream of the stop line: the reach of a camera on the mast."""
 SAMPLE_S = 10.0
 """Longest time between two readings of the entry loops (the paper's sampling interval)."""
 
@@ -93,6 +95,9 @@ class Stage:
     turns: tuple[int, ...]
     """Turns that it serves."""
     min_green_s: float
+    """Of a plan."""
+    least_green_s: float
+    """Where an execution ends it: the net's own least, else what SUMO's own signals keep, if nobody walks in it."""
     held: tuple[tuple[int, ...], ...] = ()
     """Turns that are green in each part of the clearance: still from this stage, or already for the next."""
 
@@ -324,6 +329,11 @@ class Network:
     def min_green_s(self) -> Floats:
         """(S,) shortest green of each stage."""
         return np.array([stage.min_green_s for stage in self.stages])
+
+    @cached_property
+    def least_green_s(self) -> Floats:
+        """(S,) shortest green of each stage where an execution ends it."""
+        return np.array([stage.least_green_s for stage in self.stages])
 
     @cached_property
     def cycle_s(self) -> Floats:
@@ -574,6 +584,16 @@ class View(Protocol):
     @property
     def x_veh(self) -> Floats:
         """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
+        ...
+
+    @property
+    def entered_veh(self) -> Floats:
+        """(Z,) vehicles that have come onto each link since the run began, but for who starts on it."""
+        ...
+
+    @property
+    def left_veh(self) -> Floats:
+        """(Z,) vehicles that have left each link since the run began, but for who ends on it."""
         ...
 
     def near_one_veh(self, group: int) -> float:

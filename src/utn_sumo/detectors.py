@@ -16,7 +16,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from utn_sumo.contract import Floats, LaneGroup, Link, Measurement, Network
+from utn_sumo.contract import AREA_REACH_M, Floats, LaneGroup, Link, Measurement, Network
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -24,10 +24,6 @@ STOP_LINE_M = -1.0
 """Stop-line loops stand this far before the end of the last edge."""
 TURN_M = 1.0
 """Turn loops stand this far behind the stop line."""
-
-
-AREA_REACH_M = 200.0
-"""Lane-area detectors see this far upstream of the stop line: the reach of a camera on the mast."""
 
 
 @dataclass(frozen=True)

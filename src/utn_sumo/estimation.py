@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_sumo.contract import Floats, Measurement, Network, State
-from utn_sumo.detectors import AREA_REACH_M, watched_lane_m
+from utn_sumo.contract import AREA_REACH_M, Floats, Measurement, Network, State
+from utn_sumo.detectors import watched_lane_m
 from utn_sumo.model import share_on_the_way
 
 FULL_SHARE = 0.8

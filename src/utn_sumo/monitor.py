@@ -130,7 +130,7 @@ class _Rules:
         stages = [network.stages[index] for index in junction.stages]
         longest_s = max(stage.clearance_s for stage in stages)
         green = [
-            min([least_s, *(stage.min_green_s for stage in stages if stage.state[signal] in GREEN)])
+            min([least_s, *(stage.least_green_s for stage in stages if stage.state[signal] in GREEN)])
             for signal, least_s in enumerate(self.green_s)
         ]
         return _Rules(green, self.yellow_s, [[min(least_s, longest_s) for least_s in row] for row in self.between_s])

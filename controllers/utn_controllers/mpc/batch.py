@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from utn_controllers.compiling import compiled
 from utn_controllers.mpc.agent import NOWHERE, gram
-from utn_controllers.mpc.ldl import Factorisation, compiled, factorise, substitute
+from utn_controllers.mpc.ldl import Factorisation, factorise, substitute
 from utn_controllers.mpc.problem import Programs
 from utn_controllers.mpc.receding import RecedingProblem
 from utn_sumo.contract import Floats, Forecast, Ints, State

@@ -7,26 +7,12 @@ their rows (Vanderbei 1995); no library does it for a batch on a processor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import scipy.sparse as sp
-from numba import njit
 from scipy.sparse.linalg import splu
 
+from utn_controllers.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints
-
-EXACT_ENOUGH = {"contract", "reassoc", "nsz", "arcp"}
-"""What the compiler may do to sums and products; infinities keep their meaning."""
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """The function in machine code, kept on disk from one run to the next where there is a place for it."""
-    try:
-        return njit(cache=True, fastmath=EXACT_ENOUGH)(function)
-    except RuntimeError:  # neither the package's folder nor the user's can be written
-        return njit(fastmath=EXACT_ENOUGH)(function)
 
 
 class Factorisation:

@@ -20,6 +20,8 @@ from utn_sumo.xml_files import opened
 
 MIN_GREEN_S = 10.0
 """Usual least green of a stage for which the net names none, if it shows the stage as long itself."""
+SHORT_GREEN_S = 5.0
+"""The same where greens end by what is to be seen: netconvert's `tls.min-dur`, which SUMO's own signals keep."""
 SHORTEST_STAGE_S = 5.0
 GREEN, YELLOW, OFF = "Gg", "yYu", "oO"
 SWITCHED_OFF = "its programme switches signals off (o, O)"

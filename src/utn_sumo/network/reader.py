@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import utn_network
 from utn_sumo.contract import EXIT, SAMPLE_S, Junction, LaneGroup, Link, Network, Stage, Turn
 from utn_sumo.errors import NetworkError, did_you_mean
 from utn_sumo.network import programmes
-from utn_sumo.network.programmes import MIN_GREEN_S, Block, Phase
+from utn_sumo.network.programmes import MIN_GREEN_S, SHORT_GREEN_S, Block, Phase
 from utn_sumo.network.roads import Chain, Roads, for_motors, lane_groups, motor_lanes, usual_weight
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
@@ -187,7 +188,8 @@ class _Reader:
             assert programme is not None
             signal_turns = self._signal_turns(signal, turn_index)
             first = len(stages)
-            stages += [_stage(block, position, signal_turns, self.usual_green_s) for block in programme.blocks]
+            walked = set(range(signal.letters)) - signal.of_vehicles
+            stages += [_stage(block, position, signal_turns, self.usual_green_s, walked) for block in programme.blocks]
             junctions.append(
                 Junction(
                     id=signal.id,
@@ -196,7 +198,7 @@ class _Reader:
                     offset_s=programme.offset_s + programme.begin_s,
                     signal_turns=signal_turns,
                     conflicts=signal.conflicts(),
-                    without_yellow=tuple(sorted(set(range(signal.letters)) - signal.of_vehicles)),
+                    without_yellow=tuple(sorted(walked)),
                 )
             )
         edges = sorted({edge for link in links for edge in link.edges} | {turn.to_edge for turn in turns})
@@ -303,7 +305,9 @@ def _coming_veh(net: Any, traffic: Traffic) -> dict[tuple[str, str], float]:
     return total
 
 
-def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]], usual_green_s: float) -> Stage:
+def _stage(
+    block: Block, junction: int, signal_turns: Sequence[Sequence[int]], usual_green_s: float, walked: AbstractSet[int]
+) -> Stage:
     """A stage of a junction, with the turns that it and each part of its clearance open."""
 
     def served(phase: Phase) -> tuple[int, ...]:
@@ -315,6 +319,8 @@ def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]], u
         clearance=tuple((phase.state, phase.duration_s) for phase in block.clearance),
         turns=served(block.stage),
         min_green_s=block.min_green_s(usual_green_s),
+        # Who walks needs as long whoever decides; vehicles only need not to be startled.
+        least_green_s=block.min_green_s(usual_green_s if block.stage.green & walked else SHORT_GREEN_S),
         held=tuple(served(phase) for phase in block.clearance),
     )
 

@@ -40,9 +40,20 @@ class Eyes:
         self._halting = sumo.lanearea.getLastStepHaltingNumber
         self._present = sumo.lanearea.getLastStepVehicleNumber
         self._counted = sumo.inductionloop.getIntervalVehicleNumber
+        self._counted_last = sumo.inductionloop.getLastIntervalVehicleNumber
         self._since_s = sumo.inductionloop.getTimeSinceDetection
-        self.x_veh = np.zeros(self._links)
+        self._x_veh = np.zeros(self._links)
         """(Z,) vehicles on each link when the control step began."""
+        self._entered_veh = np.zeros(self._links)
+        self._left_veh = np.zeros(self._links)
+        """(Z,) vehicles that had come onto each link by then, and that had left it."""
+
+    def begin(self, time_s: float, x_veh: Floats) -> None:
+        """A control step begins, with so many vehicles on each link (Z,)."""
+        self._x_veh = x_veh
+        if time_s > 0:
+            self._entered_veh = self._entered_veh + self._by_link(self._counted_last, self._entries, self._entry_link)
+            self._left_veh = self._left_veh + self._by_link(self._counted_last, self._exits, self._exit_link)
 
     def waiting_veh(self) -> Floats:
         """(G,) standing in the lane-area detectors."""
@@ -52,14 +63,20 @@ class Eyes:
         """(G,) in the lane-area detectors, moving or not."""
         return self._by_group(self._present)
 
-    def now_veh(self, time_s: float) -> Floats:
-        """(Z,) vehicles on each link at this moment."""
+    def crossed_veh(self, time_s: float) -> tuple[Floats, Floats]:
+        """(Z,) that have come onto each link since the control step began, and (Z,) that have left it."""
         if time_s % self._step_s == 0:
-            return self.x_veh
-        counted = self._counted
-        entered = np.bincount(self._entry_link, [counted(name) for name in self._entries], self._links)
-        left = np.bincount(self._exit_link, [counted(name) for name in self._exits], self._links)
-        return np.asarray(np.maximum(self.x_veh + entered - left, 0.0))
+            return np.zeros(self._links), np.zeros(self._links)
+        entered = self._by_link(self._counted, self._entries, self._entry_link)
+        return entered, self._by_link(self._counted, self._exits, self._exit_link)
+
+    def total_veh(self, crossed_veh: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+        """The same since the run began."""
+        return self._entered_veh + crossed_veh[0], self._left_veh + crossed_veh[1]
+
+    def now_veh(self, crossed_veh: tuple[Floats, Floats]) -> Floats:
+        """(Z,) vehicles on each link after so many have come and left in this control step."""
+        return np.asarray(np.maximum(self._x_veh + crossed_veh[0] - crossed_veh[1], 0.0))
 
     def near_one_veh(self, group: int) -> float:
         """In the lane-area detectors of one lane group, moving or not."""
@@ -70,6 +87,9 @@ class Eyes:
     def gap_one_s(self, group: int) -> float:
         """Since a vehicle was last on the stop-line loops of one lane group."""
         return float(min(map(self._since_s, self._group_stop_line[group])))
+
+    def _by_link(self, getter: Any, names: Sequence[str], link: Ints) -> Floats:
+        return np.bincount(link, list(map(getter, names)), self._links).astype(float)
 
     def _by_group(self, getter: Any) -> Floats:
         """(G,) a count by lane group; who is before the lanes part is shared out as the traffic is."""
@@ -105,7 +125,25 @@ class Sight:
     @cached_property
     def x_veh(self) -> Floats:
         """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
-        return self._eyes.now_veh(self.time_s)
+        return self._eyes.now_veh(self._crossed_veh)
+
+    @property
+    def entered_veh(self) -> Floats:
+        """(Z,) vehicles that have come onto each link since the run began, but for who starts on it."""
+        return self._total_veh[0]
+
+    @property
+    def left_veh(self) -> Floats:
+        """(Z,) vehicles that have left each link since the run began, but for who ends on it."""
+        return self._total_veh[1]
+
+    @cached_property
+    def _crossed_veh(self) -> tuple[Floats, Floats]:
+        return self._eyes.crossed_veh(self.time_s)
+
+    @cached_property
+    def _total_veh(self) -> tuple[Floats, Floats]:
+        return self._eyes.total_veh(self._crossed_veh)
 
 
 def _flat(groups: Sequence[Sequence[str]]) -> tuple[list[str], Ints]:

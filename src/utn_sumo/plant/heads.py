@@ -27,7 +27,7 @@ class Heads:
         """(J,) stage that each junction shows, or is on its way to."""
         self.begin_s = np.zeros(len(network.junctions))
         """(J,) when it began, or will."""
-        self._ready_s = self.network.min_green_s[self.stage]
+        self._ready_s = self.network.least_green_s[self.stage]
         """(J,) when it has had its least green."""
         self._ways: dict[tuple[int, int], Phases] = {}
         self._times = [Times.of(network, junction) for junction in network.junctions]
@@ -49,7 +49,7 @@ class Heads:
     def start(self, now_s: float) -> None:
         """Show every junction's first stage."""
         self.begin_s[:] = now_s
-        self._ready_s = now_s + self.network.min_green_s[self.stage]
+        self._ready_s = now_s + self.network.least_green_s[self.stage]
         for index, stage in enumerate(self.stage):
             self._show(index, self.network.stages[stage].state)
 
@@ -96,7 +96,7 @@ class Heads:
         due.append((at_s, self.network.stages[stage].state))
         self._due[index] = due
         self.stage[index], self.begin_s[index] = stage, at_s
-        self._ready_s[index] = at_s + self.network.stages[stage].min_green_s
+        self._ready_s[index] = at_s + self.network.stages[stage].least_green_s
         self.next_s = min(self.next_s, due[0][0])
         self.advance(now_s)
 

@@ -19,7 +19,19 @@ import numpy as np
 
 from utn_sumo import detectors
 from utn_sumo.case import Case
-from utn_sumo.contract import SAMPLE_S, Bools, Execution, Floats, Ints, Measurement, Network, Plan, State, View
+from utn_sumo.contract import (
+    AREA_REACH_M,
+    SAMPLE_S,
+    Bools,
+    Execution,
+    Floats,
+    Ints,
+    Measurement,
+    Network,
+    Plan,
+    State,
+    View,
+)
 from utn_sumo.errors import PlanError, PlantError
 from utn_sumo.plant.eyes import Eyes, Sight
 from utn_sumo.plant.heads import Heads
@@ -171,7 +183,7 @@ class SumoPlant:
             self._entered = [(self.time_s, np.zeros(len(self.network.links)))]
             sampled_s = self.time_s
             if self._execution is not None and state is not None:
-                self._eyes.x_veh = state.x_veh
+                self._eyes.begin(self.time_s, state.x_veh)
                 self._begin(self._execution, plan, state)
             while self.time_s < end_s:
                 switched_s = self._switch(plan) if self._execution is None else self._decide(self._execution)
@@ -216,7 +228,7 @@ class SumoPlant:
                 rest_m = sum(network.edge_length_m[edge] for edge in link.edges[at - start :])
                 to_stop_m = rest_m - vehicles.getLanePosition(name)
                 on_edge = vehicles.getRoadID(name) == route[at]
-                if on_edge and to_stop_m > detectors.AREA_REACH_M:
+                if on_edge and to_stop_m > AREA_REACH_M:
                     vehicles.setRoute(name, onward(first_edge[route[start]])[at - start :])
                     edges = []
             if edges and ahead < len(route):

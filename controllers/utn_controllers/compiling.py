@@ -1,0 +1,19 @@
+"""Functions in machine code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit
+
+EXACT_ENOUGH = {"contract", "reassoc", "nsz", "arcp"}
+"""What the compiler may do to sums and products; infinities keep their meaning."""
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """The function in machine code, kept on disk from one run to the next where there is a place for it."""
+    try:
+        return njit(cache=True, fastmath=EXACT_ENOUGH)(function)
+    except RuntimeError:  # neither the package's folder nor the user's can be written
+        return njit(fastmath=EXACT_ENOUGH)(function)

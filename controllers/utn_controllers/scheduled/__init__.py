@@ -1,0 +1,15 @@
+"""Schedule-driven signals: each junction plans the next minute anew every two seconds, and shows its beginning.
+
+A dynamic programme over who stands before the junction, who is on the way to it by the loops upstream, and whom its
+neighbours' schedules will send; in the tradition of OPAC (Gartner 1983), COP (Sen and Head 1997) and SURTRAC (Xie
+and others 2012).
+
+streams.py      what queues before a junction and moves together
+outlook.py      who stands and who comes, by stream
+programme.py    the dynamic programme of one junction
+execution.py    what goes with a plan: `scheduled`
+"""
+
+from utn_controllers.scheduled.execution import Scheduled
+
+__all__ = ["Scheduled"]

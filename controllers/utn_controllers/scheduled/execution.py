@@ -1,0 +1,148 @@
+"""`scheduled`: every junction shows the beginning of the schedule that it makes anew every two seconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from utn_controllers.scheduled.outlook import Outlook
+from utn_controllers.scheduled.programme import schedules
+from utn_controllers.scheduled.streams import Streams
+from utn_sumo.contract import Bools, Floats, Ints, Network, Plan, State, View
+
+BIN_S = 2.0
+"""Length of a bin, and time between two decisions."""
+BACK_S = 1.0
+"""What of a clearance is not lost: the yellow is driven on for longer than the next queue takes to start."""
+SOON_FADING = np.array([1.0, 0.9, 0.81, 0.73])
+"""What a vehicle loses by red in each bin before its arrival, over the last one's."""
+LEAST_WORTH = 0.05
+"""Of a vehicle that would go from an empty link into a full one."""
+BLOCKED_VEH = 1e-6
+"""What leaves in a bin towards a link that is fed no more."""
+
+
+class ScheduledSettings(BaseModel):
+    """Settings of `scheduled`, found on `utn17` (0.3 to 1.3), cologne8 and ingolstadt7 with seeds 1 to 3."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    order: Literal["any", "cycle"] = "any"
+    """Any stage may come next, or only the one that the net's own cycle has next."""
+    bounds: Literal["none", "plan"] = "none"
+    """Whether a green lasts no longer than the plan has it where others wait."""
+    horizon_s: float = Field(50.0, ge=10, le=200)
+    """How far ahead a schedule goes [s]."""
+    discharge: float = Field(1.4, gt=0, le=3)
+    """Over the saturation flow, which is that of long queues with their start: what a queue leaves with."""
+    early_s: float = Field(2.5, ge=0, le=20)
+    """How long before it reaches the stop line a vehicle has to see green [s]."""
+    slowing_s: float = Field(0.3, ge=0, le=20)
+    """What it loses by each two seconds of red before that [s]."""
+    crowding: float = Field(0.4, ge=0, le=20)
+    """By how much waiting on a full link costs more than on an empty one, in vehicles."""
+    full: float = Field(0.5, gt=0, le=2)
+    """Share of its storage from which a link is fed no more: beyond it some lane is full and stops the junction."""
+
+
+class Scheduled:
+    """Carries a plan out, or does without, by schedules for the next minute."""
+
+    Settings = ScheduledSettings
+
+    def __init__(self, network: Network, **settings: float | str):
+        self.network = network
+        self.settings = ScheduledSettings(**settings)  # type: ignore[arg-type]
+        self.every_s = BIN_S
+        self._streams = Streams(network)
+        bins = round(self.settings.horizon_s / BIN_S)
+        self._outlook = Outlook(network, self._streams, bins, BIN_S, self.settings.early_s)
+        stages = self._streams.stage
+        self._clearance = np.maximum(_bins(network.clearance_s[stages] - BACK_S), 1)
+        self._least = np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64)
+        self._follows = self._orders()
+        self._soon = self.settings.slowing_s / BIN_S * SOON_FADING
+        self._next = np.maximum(self._streams.next_link, 0)
+        self._green_s = np.full(len(network.stages), np.inf)
+        self._take_up()
+        self._warm_up()
+
+    def begin(self, plan: Plan, state: State) -> None:
+        """Take up the turning fractions as they are at present, and the plan's greens as bounds if they are to be."""
+        self._outlook.take_up(state.fraction)
+        self._take_up()
+        if self.settings.bounds == "plan":
+            self._green_s = plan.green_s
+
+    def wish(self, view: View | _Nobody) -> Ints:
+        """(J,) stage that each junction's schedule begins with."""
+        stand, come = self._outlook.look(view)
+        taken = view.x_veh / self.network.storage_veh
+        streams, settings = self._streams, self.settings
+        ahead = np.where(streams.feeds, taken[self._next], 0.0)
+        worth = np.maximum(1 + settings.crowding * (taken[streams.link] - ahead), LEAST_WORTH)
+        most = np.where(ahead > settings.full, BLOCKED_VEH, self._most)
+        rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
+        bins = self._outlook.sent_veh.shape[1]
+        return np.asarray(
+            schedules(
+                view.stage,
+                view.free,
+                np.clip(rest_s / BIN_S, 0, bins).astype(np.int64),
+                streams.stage,
+                streams.first_stage,
+                streams.first,
+                self._follows,
+                streams.serves,
+                self._clearance,
+                self._least,
+                stand,
+                come,
+                self._soon,
+                worth,
+                most,
+                self._outlook.sent_veh,
+            )
+        )
+
+    def _warm_up(self) -> None:
+        """Have the machine code made now, not at the first decision."""
+        none = np.zeros(len(self.network.links))
+        stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
+        free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
+        self.wish(_Nobody(0.0, stage, begin_s, free, np.zeros(len(self.network.groups)), none, none, none))
+
+    def _take_up(self) -> None:
+        flow_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]
+        self._most = self.settings.discharge * flow_veh_s * self._outlook.of_group * BIN_S
+
+    def _orders(self) -> Bools:
+        """(S, most stages) whether its junction's nth stage may come after each."""
+        counts = [len(junction.stages) for junction in self.network.junctions]
+        follows = np.ones((sum(counts), max(counts)), dtype=np.bool_)
+        if self.settings.order == "cycle":
+            after = np.concatenate([(np.arange(count) + 1) % count for count in counts])
+            follows = np.arange(max(counts)) == after[:, None]
+        return follows
+
+
+@dataclass(frozen=True)
+class _Nobody:
+    """What is seen of empty roads: of a view what `wish` looks at."""
+
+    time_s: float
+    stage: Ints
+    begin_s: Floats
+    free: Bools
+    near_veh: Floats
+    x_veh: Floats
+    entered_veh: Floats
+    left_veh: Floats
+
+
+def _bins(seconds: Floats) -> Ints:
+    """So many bins, the nearest number."""
+    return np.floor(seconds / BIN_S + 0.5).astype(np.int64)
