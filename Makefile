@@ -6,7 +6,7 @@ LOCK := constraints.txt pyproject.toml
 .PHONY: run test lint test-long clean
 
 run: .venv/.core
-	$(BIN)/utn run
+	$(BIN)/utn run --controller recommended
 
 test: lint
 	$(BIN)/python -m pytest
