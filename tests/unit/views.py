@@ -21,6 +21,8 @@ class Scene:
     near_veh: Floats
     x_veh: Floats
     gap_s: Floats
+    entered_veh: Floats
+    left_veh: Floats
 
     def near_one_veh(self, group: int) -> float:
         return float(self.near_veh[group])
@@ -32,7 +34,10 @@ class Scene:
 def scene(
     network: Network, time_s: float = 0.0, stage: Ints | None = None, *, veh: Floats | float = 0.0, gap_s: float = 0.0
 ) -> Scene:
-    """Everybody stands; every junction shows its first stage and is free unless it is said otherwise."""
+    """Everybody stands, and nobody has come or left since; every junction shows its first stage and is free.
+
+    Unless it is said otherwise.
+    """
     groups = np.zeros(len(network.groups))
     return Scene(
         time_s,
@@ -43,4 +48,6 @@ def scene(
         groups + veh,
         np.zeros(len(network.links)),
         groups + gap_s,
+        np.zeros(len(network.links)),
+        np.zeros(len(network.links)),
     )
