@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from utn_controllers.fixed_time import FixedTime
-from utn_controllers.scheduled import Scheduled
+from utn_controllers.scheduled.execution import Scheduled
 from utn_sumo.contract import Network
 
 

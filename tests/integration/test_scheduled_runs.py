@@ -45,11 +45,6 @@ def test_recommended_is_fixed_time_under_schedules(run_of: Run) -> None:
     assert own["total_delay_veh_h"] == named["total_delay_veh_h"]
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the result names the execution 'Scheduled', its class: the entry point leads to the package, the class"
-    " says that it is of the module in it",
-)
 def test_the_result_names_the_execution_as_it_is_registered(run_of: Run) -> None:
     assert run_of(controller="recommended", **LIGHT)[0]["execution"] == "scheduled"
 

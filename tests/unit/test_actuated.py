@@ -92,7 +92,7 @@ def test_no_cycle_is_longer_than_the_plans_and_no_green_shorter_than_its_least(u
         road.execution.begin(plan(), None)  # type: ignore[arg-type]
     for index, junction in enumerate(utn17.junctions):
         greens = road.greens_s(index)
-        assert all(green_s >= utn17.min_green_s[stage] for stage, green_s in greens)
+        assert all(green_s >= utn17.least_green_s[stage] for stage, green_s in greens)
         # In the order of the plan, none left out.
         assert [stage for stage, _ in greens] == [
             junction.stages[place % len(junction.stages)] for place in range(len(greens))
@@ -105,7 +105,7 @@ def test_a_green_that_nobody_uses_ends_with_its_least(utn17: Network) -> None:
     road = street(utn17)
     road.run(120, BUSY, 10.0)
     for index in range(len(utn17.junctions)):
-        assert all(green_s == utn17.min_green_s[stage] for stage, green_s in road.greens_s(index))
+        assert all(green_s == utn17.least_green_s[stage] for stage, green_s in road.greens_s(index))
 
 
 def test_what_a_stage_leaves_the_next_one_has(utn17: Network) -> None:
@@ -116,7 +116,7 @@ def test_what_a_stage_leaves_the_next_one_has(utn17: Network) -> None:
     road = street(utn17, plan)
     road.run(130, BUSY, gap_s)
     greens = dict(reversed(road.greens_s(0)))
-    assert greens[first] == utn17.min_green_s[first]
+    assert greens[first] == utn17.least_green_s[first]
     assert greens[second] == plan.green_s[second] + plan.green_s[first] - greens[first]
 
 

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from tests.integration import odd_nets
 from tests.unit.views import Scene, scene
 from utn_controllers.recommended import Recommended
-from utn_controllers.scheduled import Scheduled
+from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, Floats, Ints, Network
@@ -227,11 +227,6 @@ class TestProgramme:
         assert four.decide(stand, stage=present)[0] == (present + 2) % 4
         assert replace(four, cyclic=True).decide(stand, stage=present)[0] == (present + 1) % 4
 
-    @pytest.mark.xfail(
-        strict=True,
-        reason="a stage that nobody needs is never led to, so in a cycle who needs the one behind it waits for the"
-        " patience of the signal heads",
-    )
     def test_in_a_cycle_an_empty_stage_does_not_keep_those_behind_it_waiting(self) -> None:
         assert Crossing((2,) * 3, (2,) * 3, cyclic=True).decide([0.0, 0.0, 8.0])[0] == 1
 

@@ -9,7 +9,3 @@ outlook.py      who stands and who comes, by stream
 programme.py    the dynamic programme of one junction
 execution.py    what goes with a plan: `scheduled`
 """
-
-from utn_controllers.scheduled.execution import Scheduled
-
-__all__ = ["Scheduled"]

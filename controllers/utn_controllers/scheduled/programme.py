@@ -98,7 +98,7 @@ def _schedule(  # noqa: C901 - one search, all in one place for the compiler
 ) -> int:
     """The stage that one junction leads to in this bin, the `present` one if it stays; all counted within it."""
     bins = come.shape[1]
-    called = _called(present, serves, stand, come)
+    called = _called(present, follows, serves, stand, come)
     anybody = called.any()
     # The state: the stage that begins and when; for each the least cost until then, the queues, and whence.
     cost = np.full((bins + 1, len(serves)), NEVER)
@@ -147,14 +147,19 @@ def _schedule(  # noqa: C901 - one search, all in one place for the compiler
 
 
 @compiled
-def _called(present: int, serves: Bools, stand: Floats, come: Floats) -> Bools:
-    """(stages,) stages that somebody needs who has no green in the present one; if there are any, that one too."""
+def _called(present: int, follows: Bools, serves: Bools, stand: Floats, come: Floats) -> Bools:
+    """(stages,) stages that somebody needs who has no green in the present one; if there are any, that one too.
+
+    In a fixed order the way to them leads through all.
+    """
     called = np.zeros(len(serves), np.bool_)
     for stream in range(len(stand)):
         if not serves[present, stream] and stand[stream] + come[stream].sum() >= SOME_VEH:
             for stage in range(len(serves)):
                 called[stage] |= serves[stage, stream]
-    called[present] = called.any()
+    if called.any():
+        called[present] = True
+        called |= not follows.all()
     return called
 
 
