@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -12,8 +11,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from tests.integration import odd_nets
 
-from utn_sumo import bridge, monitor, replay
-from utn_sumo.contract import Network
+from utn_sumo import bridge, replay
 from utn_sumo.errors import SettingError
 from utn_sumo.scenario import scenario
 from utn_sumo.sumo_tools import sumo_binary
@@ -54,18 +52,10 @@ def test_prices_keep_a_crowded_network_moving(delay_veh_h: Callable[..., float])
     assert delay_veh_h("priced", 1.3) < 0.5 * min(delay_veh_h(each, 1.3) for each in ("max_wave", "fixed"))
 
 
-def test_nobody_waits_for_ever(utn17: Network, tmp_path: Path) -> None:
-    bridge.run(scenario(controller="max_wave", demand=1.3, hours=1, seed=3), tmp_path / "run")
-    switches = monitor.read_switches(tmp_path / "run" / "signals.xml")
-    for junction in utn17.junctions:
-        for stage in junction.stages:
-            shown = [
-                (start, end)
-                for (start, state), (end, _) in pairwise(switches[junction.id])
-                if state == utn17.stages[stage].state
-            ]
-            # At this demand somebody waits before every stage all the time.
-            assert max(after - end for (_, end), (after, _) in pairwise(shown)) <= 180
+def test_nobody_waits_for_ever(tmp_path: Path) -> None:
+    result = bridge.run(scenario(controller="max_wave", demand=1.3, hours=1, seed=3), tmp_path / "run")
+    # The rule alone would let somebody wait longer than the signal heads have patience for.
+    assert 150 < result["longest_red_s"] <= 180
 
 
 @pytest.mark.parametrize("rule", ["priced"])
