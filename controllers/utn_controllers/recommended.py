@@ -8,7 +8,7 @@ from utn_sumo.contract import Network
 
 
 class Recommended(FixedTime):
-    """`scheduled` with no plan above it: a plan's greens as its bounds bring more delay at every demand so far."""
+    """`scheduled` with no plan above it: the greens of `dmpc` as its bounds bring more delay on `utn17` at 1.3."""
 
     Settings = Scheduled.Settings
 
