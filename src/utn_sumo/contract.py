@@ -285,6 +285,18 @@ class Network:
         return np.array([link.length_m / link.free_speed_m_s for link in self.links])
 
     @cached_property
+    def watched_veh(self) -> Floats:
+        """(Z,) vehicles that fit on what the lane-area detectors see of each link."""
+        length_m = np.array([link.length_m for link in self.links])
+        return np.asarray(self.storage_veh * np.minimum(1.0, AREA_REACH_M / length_m))
+
+    def group_shares(self, fraction: Floats) -> Floats:
+        """(G,) of a link's traffic what takes the lanes of each group, by the turning fractions (M,)."""
+        share = np.bincount(self.turn_group, fraction, len(self.groups))
+        whole = np.bincount(self.group_link, share, len(self.links))[self.group_link]
+        return np.asarray(share / np.maximum(whole, 1e-9))
+
+    @cached_property
     def queue_spacing_s_veh(self) -> Floats:
         """(Z,) by how much a queued vehicle shortens the way to the queue's tail, in time."""
         return np.array([link.queue_spacing_m / link.free_speed_m_s for link in self.links])

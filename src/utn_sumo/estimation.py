@@ -76,7 +76,7 @@ class Estimator:
         self._turning_veh = self._known_turning_veh
         length_m = np.array([link.length_m for link in network.links])
         speed_m_s = np.array([link.free_speed_m_s for link in known.links])
-        self._watched_veh = network.storage_veh * np.minimum(1, AREA_REACH_M / length_m)
+        self._watched_veh = network.watched_veh
         group_m, before_m = watched_lane_m(network)
         lane_m = before_m + np.bincount(network.group_link, group_m, links)
         self._group_veh = np.maximum(self._watched_veh[network.group_link] * group_m / lane_m[network.group_link], 1.0)

@@ -16,7 +16,7 @@ QUEUED_SHARE = 0.5
 """Share of its jam from which what the lane-area detectors see is a queue that reaches back beyond them."""
 
 
-class Sight(Protocol):
+class Seen(Protocol):
     """What of a view it takes to know who comes (contract.View)."""
 
     @property
@@ -47,7 +47,6 @@ class Outlook:
         """(Z,) from entry to arrival."""
         self._sight_s = np.maximum(np.minimum(length_m, AREA_REACH_M) / speed_m_s - early_s, 0.0)
         """(Z,) from where the lane-area detectors begin to arrival."""
-        self._seen_jam_veh = network.storage_veh * np.minimum(1.0, AREA_REACH_M / length_m)
         self._hidden = length_m > AREA_REACH_M
         self._came = np.zeros((2, int(np.ceil(self._due_s.max(initial=0.0) / bin_s)) + 1, len(network.links)))
         """Vehicles that came onto each link, and into sight on it, in each of the last bins, in a ring."""
@@ -62,12 +61,9 @@ class Outlook:
     def take_up(self, fraction: Floats) -> None:
         """Go by these turning fractions (M,) from now on."""
         self.of_link, self.of_group = self.streams.shares(fraction)
-        group_link = self.network.group_link
-        share = np.bincount(self.network.turn_group, fraction, len(group_link))
-        whole = np.bincount(group_link, share, len(self.network.links))[group_link]
-        self._group_share = share / np.maximum(whole, 1e-9)
+        self._group_share = self.network.group_shares(fraction)
 
-    def look(self, view: Sight) -> tuple[Floats, Floats]:
+    def look(self, view: Seen) -> tuple[Floats, Floats]:
         """(N,) vehicles that stand or are about to, (N, K) those that arrive in each bin. A bin has gone by since."""
         near_veh = view.near_veh
         in_sight_veh = np.bincount(self.network.group_link, near_veh, len(self.network.links))
@@ -86,7 +82,7 @@ class Outlook:
             in_sight_veh,
             self._due_s,
             self._sight_s,
-            self._seen_jam_veh,
+            self.network.watched_veh,
             self._hidden,
             self._group_share,
             streams.link,

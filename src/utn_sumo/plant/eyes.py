@@ -22,8 +22,7 @@ class Eyes:
         self._groups = len(network.groups)
         self._links = len(network.links)
         self._group_link = network.group_link
-        share = np.bincount(network.turn_group, network.fraction, self._groups)
-        self._share = share / np.maximum(np.bincount(self._group_link, share, self._links), 1e-9)[self._group_link]
+        self._share = network.group_shares(network.fraction)
         """(G,) of a link's traffic what takes the lanes of each group."""
         self._areas, self._area_group = _flat(ids.group)
         self._before, self._before_link = _flat(ids.upstream)
