@@ -8,10 +8,11 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import Bools, Floats, Ints, Network, Plan, State, View
+from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network, Plan, State, View
 
 BIN_S = 2.0
 """Length of a bin, and time between two decisions."""
@@ -65,8 +66,10 @@ class Scheduled:
         self._least = np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64)
         self._follows = self._orders()
         self._soon = self.settings.slowing_s / BIN_S * SOON_FADING
-        self._next = np.maximum(self._streams.next_link, 0)
-        self._green_s = np.full(len(network.stages), np.inf)
+        self._plan = np.zeros((len(network.junctions), bins), dtype=np.int64)
+        """(J, K) the last schedules."""
+        self._endless = np.full(len(network.junctions), bins)
+        self._green_s: Floats | None = None
         self._take_up()
         self._warm_up()
 
@@ -80,18 +83,26 @@ class Scheduled:
     def wish(self, view: View | _Nobody) -> Ints:
         """(J,) stage that each junction's schedule begins with."""
         stand, come = self._outlook.look(view)
-        taken = view.x_veh / self.network.storage_veh
         streams, settings = self._streams, self.settings
-        ahead = np.where(streams.feeds, taken[self._next], 0.0)
-        worth = np.maximum(1 + settings.crowding * (taken[streams.link] - ahead), LEAST_WORTH)
-        most = np.where(ahead > settings.full, BLOCKED_VEH, self._most)
-        rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
-        bins = self._outlook.sent_veh.shape[1]
+        worth, most = _priced(
+            view.x_veh,
+            self.network.storage_veh,
+            streams.link,
+            streams.next_link,
+            self._most,
+            settings.crowding,
+            settings.full,
+        )
+        if self._green_s is None:
+            rest = self._endless
+        else:
+            rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
+            rest = np.clip(rest_s / BIN_S, 0, self._plan.shape[1]).astype(np.int64)
         return np.asarray(
             schedules(
                 view.stage,
                 view.free,
-                np.clip(rest_s / BIN_S, 0, bins).astype(np.int64),
+                rest,
                 streams.stage,
                 streams.first_stage,
                 streams.first,
@@ -104,6 +115,7 @@ class Scheduled:
                 self._soon,
                 worth,
                 most,
+                self._plan,
                 self._outlook.sent_veh,
             )
         )
@@ -127,6 +139,21 @@ class Scheduled:
             after = np.concatenate([(np.arange(count) + 1) % count for count in counts])
             follows = np.arange(max(counts)) == after[:, None]
         return follows
+
+
+@compiled
+def _priced(
+    x: Floats, storage: Floats, links: Ints, next_links: Ints, most: Floats, crowding: float, full: float
+) -> tuple[Floats, Floats]:
+    """(N,) what a vehicle of each stream is worth, and (N,) how many leave in a bin of green."""
+    worth, moving = np.empty(len(links)), most.copy()
+    for stream, ahead in enumerate(next_links):
+        taken = x[ahead] / storage[ahead] if ahead != EXIT else 0.0
+        own = x[links[stream]] / storage[links[stream]]
+        worth[stream] = max(1 + crowding * (own - taken), LEAST_WORTH)
+        if taken > full:
+            moving[stream] = BLOCKED_VEH
+    return worth, moving
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ class Seen(Protocol):
     """What of a view it takes to know who comes (contract.View)."""
 
     @property
+    def free(self) -> Bools: ...
+    @property
     def near_veh(self) -> Floats: ...
     @property
     def x_veh(self) -> Floats: ...
@@ -64,26 +66,29 @@ class Outlook:
         self._group_share = self.network.group_shares(fraction)
 
     def look(self, view: Seen) -> tuple[Floats, Floats]:
-        """(N,) vehicles that stand or are about to, (N, K) those that arrive in each bin. A bin has gone by since."""
-        near_veh = view.near_veh
-        in_sight_veh = np.bincount(self.network.group_link, near_veh, len(self.network.links))
-        until_now = np.array([view.entered_veh, view.left_veh + in_sight_veh])
+        """(N,) vehicles that stand or are about to, (N, K) those that arrive in each bin; 0 where a junction is not free.
+
+        A bin has gone by since the last look.
+        """
         self._now = (self._now + 1) % self._came.shape[1]
-        self._came[:, self._now] = np.maximum(until_now - self._before_veh, 0.0)
-        self._before_veh = until_now
-        streams = self.streams
+        streams, network = self.streams, self.network
         stand, come = _look(
+            view.free,
+            view.near_veh,
+            view.x_veh,
+            view.entered_veh,
+            view.left_veh,
+            self._before_veh,
             self._came,
             self._now,
             self._rate,
             self.sent_veh,
-            view.x_veh,
-            near_veh,
-            in_sight_veh,
             self._due_s,
             self._sight_s,
-            self.network.watched_veh,
+            network.watched_veh,
             self._hidden,
+            network.link_junction,
+            network.group_link,
             self._group_share,
             streams.link,
             streams.group,
@@ -97,17 +102,22 @@ class Outlook:
 
 @compiled
 def _look(
+    free: Bools,
+    near: Floats,
+    x: Floats,
+    entered: Floats,
+    left: Floats,
+    before: Floats,
     came: Floats,
     now: int,
     rate: Floats,
     sent: Floats,
-    x: Floats,
-    near: Floats,
-    in_sight: Floats,
     due_s: Floats,
     sight_s: Floats,
     seen_jam: Floats,
     hidden: Bools,
+    junction: Ints,
+    group_link: Ints,
     group_share: Floats,
     stream_link: Ints,
     stream_group: Ints,
@@ -117,9 +127,20 @@ def _look(
     bin_s: float,
 ) -> tuple[Floats, Floats]:
     links, bins = len(x), sent.shape[1]
+    in_sight = np.zeros(links)
+    for group in range(len(near)):
+        in_sight[group_link[group]] += near[group]
+    asked = np.empty(links, np.bool_)
+    for link in range(links):
+        for row, until_now in enumerate((entered[link], left[link] + in_sight[link])):
+            came[row, now, link] = max(until_now - before[row, link], 0.0)
+            before[row, link] = until_now
+        asked[link] = free[junction[link]]
     coming = np.zeros((links, bins))
     on_way, jammed = np.zeros(links), np.zeros(links)
     for link in range(links):
+        if not asked[link]:
+            continue
         # In sight are those who came into it last.
         late = _arrive(came[1, :, link], now, in_sight[link], 0.0, sight_s[link], coming[link], bin_s)
         on_way[link] = in_sight[link] - late
@@ -132,10 +153,12 @@ def _look(
             jammed[link] = late
         else:
             coming[link, min(bins - 1, int(sight_s[link] / bin_s))] += late
-    _send(sent, next_link, came[0, now], rate, due_s, coming, bin_s)
+    _send(asked, sent, next_link, came[0, now], rate, due_s, coming, bin_s)
     stand, come = np.zeros(len(stream_link)), np.zeros((len(stream_link), bins))
     for stream in range(len(stream_link)):
         group, link = stream_group[stream], stream_link[stream]
+        if not asked[link]:
+            continue
         # Who is in sight and not on the way stands, or moves in a queue.
         queue = max(near[group] - group_share[group] * on_way[link], 0.0) + group_share[group] * jammed[link]
         stand[stream] = queue * of_group[stream]
@@ -164,7 +187,14 @@ def _arrive(came: Floats, now: int, veh: float, from_s: float, due_s: float, com
 
 @compiled
 def _send(
-    sent: Floats, next_link: Ints, came: Floats, rate: Floats, due_s: Floats, coming: Floats, bin_s: float
+    asked: Bools,
+    sent: Floats,
+    next_link: Ints,
+    came: Floats,
+    rate: Floats,
+    due_s: Floats,
+    coming: Floats,
+    bin_s: float,
 ) -> None:
     """Adds whom the neighbours will send, if they do as they have planned, and as many more as came of late."""
     links, bins = coming.shape
@@ -176,10 +206,14 @@ def _send(
         link = next_link[stream]
         if link >= 0:
             rate[1, link] += fresh * sent[stream, 0]
+            if not asked[link]:
+                continue
             delay = int(due_s[link] / bin_s + 0.5)
             for place in range(delay, bins):
                 coming[link, place] += sent[stream, place - delay]
     for link in range(links):
+        if not asked[link]:
+            continue
         others = max(rate[0, link] - rate[1, link], 0.0)
         for place in range(bins):
             if (place + 0.5) * bin_s > due_s[link]:

@@ -2,7 +2,9 @@
 
 Forward over the bins, as COP (Sen and Head 1997). A state is a stage that begins in a bin; of two ways that lead to
 it, the one on which less has been waited goes on, with the queues that it leaves. From there the stage may last until
-any later bin.
+any later bin. Whoever has red only adds to their queue, so that what they wait is a difference of sums made once;
+bin by bin go only those who have green. A way on which more has been waited, or will have been at the least, than on
+another that is known to its end is left.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ NEVER = 1e18
 """Cost of what can't be reached."""
 SOME_VEH = 1e-3
 """Fewer than so many are nobody."""
+ALIKE = 1e-9
+"""Costs that differ by no more are the same: of ways alike the one found first is kept, whatever the rounding."""
 
 
 @compiled
@@ -35,6 +39,7 @@ def schedules(
     soon: Floats,
     worth: Floats,
     most: Floats,
+    plan: Ints,
     sent: Floats,
 ) -> Ints:
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
@@ -43,22 +48,19 @@ def schedules(
     rows from `first_stage` on, their streams from `first`; `follows` (S, most stages of a junction) whether its
     junction's nth stage may come after a row's. `clearance` and `least` (S,) in bins. `stand` (N,), `come` (N, K)
     vehicles; `soon` (n,) what it costs to show an arriving vehicle red in each bin before its arrival; `worth` (N,)
-    weight of a vehicle, `most` (N,) that leave in a bin of green. `sent` (N, K) is given what each stream sends off in
-    each bin; of junctions that are not free, what is left of their last schedule.
+    weight of a vehicle, `most` (N,) that leave in a bin of green.
+
+    `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
+    those of now. Of a schedule is said which of its junction's stages is shown in each bin, -1 for a clearance; of
+    junctions that are not free, what is left of the last one.
     """
-    streams, bins = sent.shape
-    slowed = np.zeros((streams, bins))
-    for stream in range(streams):
-        for place in range(bins - 1):
-            sent[stream, place] = sent[stream, place + 1]
-        for place in range(bins):
-            for ahead in range(min(len(soon), bins - 1 - place)):
-                slowed[stream, place] += soon[ahead] * come[stream, place + 1 + ahead]
     wish = stage.copy()
     for junction in range(len(stage)):
         a, b = first[junction], first[junction + 1]
         low, high = first_stage[junction], first_stage[junction + 1]
+        plan[junction, :-1] = plan[junction, 1:]
         if not free[junction] or b == a:
+            sent[a:b, :-1] = sent[a:b, 1:]
             continue
         row = low
         while stages[row] != stage[junction]:
@@ -72,9 +74,10 @@ def schedules(
             least[low:high],
             stand[a:b],
             come[a:b],
-            slowed[a:b],
+            soon,
             worth[a:b],
             most[a:b],
+            plan[junction],
             sent[a:b],
         )
         wish[junction] = stages[low + chosen]
@@ -82,7 +85,7 @@ def schedules(
 
 
 @compiled
-def _schedule(  # noqa: C901 - one search, all in one place for the compiler
+def _schedule(
     present: int,
     rest: int,
     follows: Bools,
@@ -91,59 +94,30 @@ def _schedule(  # noqa: C901 - one search, all in one place for the compiler
     least: Ints,
     stand: Floats,
     come: Floats,
-    slowed: Floats,
+    soon: Floats,
     worth: Floats,
     most: Floats,
+    plan: Ints,
     sent: Floats,
 ) -> int:
     """The stage that one junction leads to in this bin, the `present` one if it stays; all counted within it."""
-    bins = come.shape[1]
+    chosen = present
     called = _called(present, follows, serves, stand, come)
-    anybody = called.any()
-    # The state: the stage that begins and when; for each the least cost until then, the queues, and whence.
-    cost = np.full((bins + 1, len(serves)), NEVER)
-    queue = np.zeros((bins + 1, *serves.shape))
-    # Whence: when the stage before began, which it was, when it ended.
-    whence = np.zeros((bins + 1, len(serves), 3), np.int64)
-    cost[0, present] = 0.0
-    queue[0, present] = stand
-    served, cleared, red = np.zeros(len(stand)), np.zeros(len(stand)), np.zeros(len(stand), np.bool_)
-    best, last_begin, last_stage = NEVER, 0, present
-    for begin in range(bins):
-        for stage in range(len(serves)):
-            if cost[begin, stage] >= NEVER:
-                continue
-            is_first = begin == 0 and stage == present
-            may_end = 0 if is_first else begin + least[stage]
-            spent, now = cost[begin, stage], begin
-            served[:] = queue[begin, stage]
-            while now < bins:
-                if anybody and now >= may_end:
-                    # It ends here: others begin after its clearance, where that is the best way there.
-                    until, opens = spent, min(now + clearance[stage], bins)
-                    cleared[:] = served
-                    for place in range(now, opens):
-                        until += _bin(red, place, cleared, come, slowed, worth, most)
-                    for other in range(len(serves)):
-                        if other != stage and called[other] and follows[stage, other] and until < cost[opens, other]:
-                            cost[opens, other] = until
-                            queue[opens, other] = cleared
-                            whence[opens, other, 0] = begin
-                            whence[opens, other, 1] = stage
-                            whence[opens, other, 2] = now
-                    if is_first and now >= rest:
-                        break
-                spent += _bin(serves[stage], now, served, come, slowed, worth, most)
-                now += 1
-            if now == bins and spent < best:
-                best, last_begin, last_stage = spent, begin, stage
-    for stage in range(len(serves)):
-        # Ways that end amid a clearance.
-        if cost[bins, stage] < best:
-            best, last_begin, last_stage = cost[bins, stage], bins, stage
-    shown, chosen = _shown(present, last_begin, last_stage, whence)
-    _send_off(shown, serves, stand, come, slowed, worth, most, sent)
-    return int(chosen)
+    if called.any():
+        came, grown, paid, slowed = _sums(serves, come, soon, worth)
+        # What was best a bin ago is seldom far from what is best now.
+        known = _waited(plan, serves, stand, come, slowed, worth, most)
+        for limit in (known + ALIKE * (2 + known), NEVER):
+            chosen = _search(
+                present, rest, called, follows, serves, clearance, least, stand, come, came, grown, paid, worth, most,
+                limit, plan,
+            )  # fmt: skip
+            if chosen >= 0:
+                break
+    else:
+        plan[:] = present
+    _send_off(plan, serves, stand, come, most, sent)
+    return chosen
 
 
 @compiled
@@ -164,52 +138,192 @@ def _called(present: int, follows: Bools, serves: Bools, stand: Floats, come: Fl
 
 
 @compiled
-def _shown(present: int, begin: int, stage: int, whence: Ints) -> tuple[Ints, int]:
-    """(K,) stage shown in each bin on the way to the last one, which began at `begin`, -1 for clearance; the one that
-    is led to in the first bin.
+def _search(  # noqa: C901 - one search, all in one place for the compiler
+    present: int,
+    rest: int,
+    called: Bools,
+    follows: Bools,
+    serves: Bools,
+    clearance: Ints,
+    least: Ints,
+    stand: Floats,
+    come: Floats,
+    came: Floats,
+    grown: Floats,
+    paid: Floats,
+    worth: Floats,
+    most: Floats,
+    limit: float,
+    plan: Ints,
+) -> int:
+    """The stage that is led to in the first bin, and into `plan` (K,) that of each; -1 if all costs `limit` or more."""
+    stages, streams, bins = len(serves), len(stand), len(plan)
+    # The state: the stage that begins and when; for each the least cost until then, the queues, and whence.
+    cost = np.full((bins + 1, stages), NEVER)
+    queue = np.empty((bins, stages, streams))
+    # Whence: when the stage before began, which it was, when it ended.
+    whence = np.zeros((bins + 1, stages, 3), np.int64)
+    cost[0, present] = 0.0
+    queue[0, present] = stand
+    best, last_begin, last_stage = limit, -1, present
+    others, green, veh = np.empty(stages, np.int64), np.empty(streams, np.int64), np.empty(streams)
+    for begin in range(bins):
+        for stage in range(stages):
+            spent = cost[begin, stage]
+            if spent >= best - ALIKE:
+                continue
+            if begin > 0:
+                _lead(begin, stage, whence, serves, come, came, most, queue)
+            count = 0
+            for other in range(stages):
+                if other != stage and called[other] and follows[stage, other]:
+                    others[count] = other
+                    count += 1
+            greens, held, held_most, moving = 0, 0.0, 0.0, 0.0
+            for stream in range(streams):
+                weight = worth[stream] * queue[begin, stage, stream]
+                if serves[stage, stream]:
+                    green[greens], veh[greens] = stream, queue[begin, stage, stream]
+                    greens += 1
+                    moving += weight
+                else:
+                    held += weight
+                    held_most += worth[stream] * most[stream]
+            may_end = begin + least[stage] if begin > 0 else 0
+            must_end = rest if begin == 0 else bins
+            now = begin
+            while now < bins:
+                # It ends here or later: others begin after its clearance, where that is the best way there.
+                opens = min(max(now, may_end) + clearance[stage], bins)
+                least_held = held + grown[stage, opens] - grown[stage, now]
+                if spent + paid[stage, opens] - paid[stage, now] + (opens - now) * (held - grown[stage, now]) + _drained(least_held, held_most, bins - opens) >= best - ALIKE:
+                    break
+                if now >= may_end:
+                    until = spent + paid[stages, opens] - paid[stages, now] + (opens - now) * (held + moving - grown[stages, now])
+                    for place in range(count):
+                        other = others[place]
+                        if until < cost[opens, other] - ALIKE:
+                            cost[opens, other] = until
+                            whence[opens, other, 0] = begin
+                            whence[opens, other, 1] = stage
+                            whence[opens, other, 2] = now
+                    if now >= must_end:
+                        break
+                spent += held + paid[stage, now + 1] - paid[stage, now] - grown[stage, now]
+                held += grown[stage, now + 1] - grown[stage, now]
+                moving = 0.0
+                for place in range(greens):
+                    stream = green[place]
+                    veh[place] = max(veh[place] + come[stream, now] - most[stream], 0.0)
+                    moving += worth[stream] * veh[place]
+                spent += moving
+                now += 1
+            if now == bins and spent < best - ALIKE:
+                best, last_begin, last_stage = spent, begin, stage
+    for stage in range(stages):
+        # Ways that end amid a clearance.
+        if cost[bins, stage] < best - ALIKE:
+            best, last_begin, last_stage = cost[bins, stage], bins, stage
+    return _trace(present, last_begin, last_stage, whence, plan) if last_begin >= 0 else -1
+
+
+@compiled
+def _sums(serves: Bools, come: Floats, soon: Floats, worth: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """What the costs of red are made of, all but the last of it up to each bin and no further.
+
+    (N, K + 1) who has come; for each stage, and last for clearances, (stages + 1, K + 1) what those who have red in
+    it weigh who have come, and what would be waited in red if nobody had stood before. (N, K) what is lost in a bin of
+    red by those who come soon.
     """
-    bins = len(whence) - 1
-    shown = np.full(bins, -1)
-    now, chosen = bins, present
+    stages, (streams, bins) = len(serves), come.shape
+    came = np.zeros((streams, bins + 1))
+    grown, paid = np.zeros((stages + 1, bins + 1)), np.zeros((stages + 1, bins + 1))
+    slowed = np.zeros((streams, bins))
+    for stream in range(streams):
+        for place in range(bins):
+            came[stream, place + 1] = came[stream, place] + come[stream, place]
+            for ahead in range(min(len(soon), bins - 1 - place)):
+                slowed[stream, place] += soon[ahead] * come[stream, place + 1 + ahead]
+        for stage in range(stages + 1):
+            if stage == stages or not serves[stage, stream]:
+                waited = 0.0
+                for place in range(bins):
+                    waited += worth[stream] * (came[stream, place + 1] + slowed[stream, place])
+                    grown[stage, place + 1] += worth[stream] * came[stream, place + 1]
+                    paid[stage, place + 1] += waited
+    return came, grown, paid, slowed
+
+
+@compiled
+def _waited(
+    plan: Ints, serves: Bools, stand: Floats, come: Floats, slowed: Floats, worth: Floats, most: Floats
+) -> float:
+    """What is waited by a `plan`."""
+    total = 0.0
+    for stream in range(len(stand)):
+        veh, waited = stand[stream], 0.0
+        for place in range(len(plan)):
+            veh += come[stream, place]
+            if plan[place] >= 0 and serves[plan[place], stream]:
+                veh = max(veh - most[stream], 0.0)
+            else:
+                waited += slowed[stream, place]
+            waited += veh
+        total += worth[stream] * waited
+    return total
+
+
+@compiled
+def _red(grown: Floats, paid: Floats, stage: int, since: int, until: int, held: float) -> float:
+    """What those wait in some bins who have red then, and of whom so much stood before."""
+    return paid[stage, until] - paid[stage, since] + (until - since) * (held - grown[stage, since])
+
+
+@compiled
+def _lead(
+    begin: int, stage: int, whence: Ints, serves: Bools, come: Floats, came: Floats, most: Floats, queue: Floats
+) -> None:
+    """Fills the queues when a stage begins by those when the stage before it did."""
+    before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
+    for stream in range(len(most)):
+        veh, since = queue[before, was, stream], before
+        if serves[was, stream]:
+            for place in range(before, end):
+                veh = max(veh + come[stream, place] - most[stream], 0.0)
+            since = end
+        queue[begin, stage, stream] = veh + came[stream, begin] - came[stream, since]
+
+
+@compiled
+def _drained(veh: float, most: float, bins: int) -> float:
+    """What a queue waits at the least in so many bins while it leaves and nobody comes."""
+    if veh >= most * bins:
+        return bins * veh - most * (bins * (bins + 1) / 2)
+    return veh * (veh / most - 1) / 2
+
+
+@compiled
+def _trace(present: int, begin: int, stage: int, whence: Ints, plan: Ints) -> int:
+    """The stage that is led to in the first bin of the way whose last stage began at `begin`, and into `plan` all."""
+    now, chosen = len(plan), present
     while True:
-        shown[begin:now] = stage
+        plan[begin:now] = stage
         if begin == 0:
-            return shown, chosen
+            return chosen
         before, was, now = whence[begin, stage]
+        plan[now:begin] = -1
         if now == 0:
             chosen = stage
         begin, stage = before, was
 
 
 @compiled
-def _send_off(
-    shown: Ints,
-    serves: Bools,
-    stand: Floats,
-    come: Floats,
-    slowed: Floats,
-    worth: Floats,
-    most: Floats,
-    sent: Floats,
-) -> None:
-    """Fills `sent` with what leaves under the stages `shown`."""
-    queue, red = stand.copy(), np.zeros(len(stand), np.bool_)
-    for place in range(len(shown)):
-        before = queue + come[:, place]
-        _bin(serves[shown[place]] if shown[place] >= 0 else red, place, queue, come, slowed, worth, most)
-        sent[:, place] = before - queue
-
-
-@compiled
-def _bin(green: Bools, place: int, queue: Floats, come: Floats, slowed: Floats, worth: Floats, most: Floats) -> float:
-    """What is waited in a bin in which the streams of `green` move; `queue` becomes that behind it."""
-    waited = 0.0
-    for stream in range(len(queue)):
-        veh = queue[stream] + come[stream, place]
-        if green[stream]:
-            veh -= min(veh, most[stream])
-        else:
-            waited += worth[stream] * slowed[stream, place]
-        queue[stream] = veh
-        waited += worth[stream] * veh
-    return waited
+def _send_off(plan: Ints, serves: Bools, stand: Floats, come: Floats, most: Floats, sent: Floats) -> None:
+    """Fills `sent` with what leaves by a `plan`."""
+    for stream in range(len(stand)):
+        veh = stand[stream]
+        for place, stage in enumerate(plan):
+            veh += come[stream, place]
+            leaves = min(veh, most[stream]) if stage >= 0 and serves[stage, stream] else 0.0
+            sent[stream, place] = leaves
+            veh -= leaves

@@ -1,4 +1,4 @@
-"""What the detectors show at one moment, each read when somebody asks for it."""
+"""What the detectors show at one moment, each read when somebody asks for it, and if it can have changed."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import AREA_REACH_M, Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.heads import Heads
+
+
+FASTEST = 2.0
+"""Nobody drives more than so many times the speed of the road."""
 
 
 class Eyes:
@@ -26,12 +30,18 @@ class Eyes:
         """(G,) of a link's traffic what takes the lanes of each group."""
         self._areas, self._area_group = _flat(ids.group)
         self._before, self._before_link = _flat(ids.upstream)
+        self._all_areas = [*self._areas, *self._before]
+        self._area_link = np.concatenate([self._group_link[self._area_group], self._before_link])
+        sight_m = np.minimum([link.length_m for link in network.links], AREA_REACH_M)
+        self._sight_s = sight_m / np.array([link.free_speed_m_s for link in network.links])
+        """(Z,) from where the lane-area detectors begin to the stop line."""
         self._entries, self._entry_link = _flat([(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)])
-        turn_exits = [
+        self._turn_exits = [
             [name for turn in np.flatnonzero(network.turn_link == link) for name in ids.turn[turn]]
             for link in range(self._links)
         ]
-        self._exits, self._exit_link = _flat([(*a, *b) for a, b in zip(turn_exits, ids.parting, strict=True)])
+        self._exits, self._exit_link = _flat(self._turn_exits)
+        self._partings, self._parting_link = _flat(ids.parting)
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
@@ -47,27 +57,55 @@ class Eyes:
         self._left_veh = np.zeros(self._links)
         """(Z,) vehicles that had come onto each link by then, and that had left it."""
 
+        self._turned_veh = np.zeros(self._links)
+        """(Z,) vehicles that have turned off each link since the control step began, as last read."""
+        self._turned_s = -np.inf
+        """When that was."""
+        self._seen_s = -np.inf
+        self._seen_veh: list[int] = []
+        """When the lane-area detectors were last looked at for who is there, and what each of them showed."""
+        self._anybody = np.ones(self._links, dtype=np.bool_)
+        """(Z,) whether then anybody was in sight on a link."""
+        self._quiet = np.zeros(self._links, dtype=np.bool_)
+        """(Z,) links that nobody can have turned off since it was read: nobody was in sight then, and nobody is now."""
+
     def begin(self, time_s: float, x_veh: Floats) -> None:
         """A control step begins, with so many vehicles on each link (Z,)."""
         self._x_veh = x_veh
         if time_s > 0:
-            self._entered_veh = self._entered_veh + self._by_link(self._counted_last, self._entries, self._entry_link)
-            self._left_veh = self._left_veh + self._by_link(self._counted_last, self._exits, self._exit_link)
+            counted = self._counted_last
+            self._entered_veh = self._entered_veh + self._by_link(counted, self._entries, self._entry_link)
+            self._left_veh = self._left_veh + self._by_link(counted, self._exits, self._exit_link)
+            self._left_veh += self._by_link(counted, self._partings, self._parting_link)
+        self._turned_veh[:] = 0.0
 
-    def waiting_veh(self) -> Floats:
+    def waiting_veh(self, time_s: float) -> Floats:
         """(G,) standing in the lane-area detectors."""
-        return self._by_group(self._halting)
+        if time_s != self._seen_s:
+            return self._by_group(list(map(self._halting, self._all_areas)))
+        # Nobody stands where nobody is.
+        seen = zip(self._all_areas, self._seen_veh, strict=True)
+        return self._by_group([veh and self._halting(name) for name, veh in seen])
 
-    def near_veh(self) -> Floats:
+    def near_veh(self, time_s: float) -> Floats:
         """(G,) in the lane-area detectors, moving or not."""
-        return self._by_group(self._present)
+        self._seen_veh = list(map(self._present, self._all_areas))
+        anybody = np.bincount(self._area_link, self._seen_veh, self._links) > 0
+        self._quiet = (self._sight_s > FASTEST * (time_s - self._seen_s)) & ~(anybody | self._anybody)
+        self._quiet &= self._turned_s == self._seen_s
+        self._anybody, self._seen_s = anybody, time_s
+        return self._by_group(self._seen_veh)
 
     def crossed_veh(self, time_s: float) -> tuple[Floats, Floats]:
         """(Z,) that have come onto each link since the control step began, and (Z,) that have left it."""
+        self._turned_s = time_s
         if time_s % self._step_s == 0:
             return np.zeros(self._links), np.zeros(self._links)
         entered = self._by_link(self._counted, self._entries, self._entry_link)
-        return entered, self._by_link(self._counted, self._exits, self._exit_link)
+        busy = ~self._quiet if time_s == self._seen_s else np.ones(self._links, dtype=np.bool_)
+        for link in busy.nonzero()[0].tolist():
+            self._turned_veh[link] = sum(map(self._counted, self._turn_exits[link]))
+        return entered, self._turned_veh + self._by_link(self._counted, self._partings, self._parting_link)
 
     def total_veh(self, crossed_veh: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
         """The same since the run began."""
@@ -88,14 +126,14 @@ class Eyes:
         return float(min(map(self._since_s, self._group_stop_line[group])))
 
     def _by_link(self, getter: Any, names: Sequence[str], link: Ints) -> Floats:
-        return np.bincount(link, list(map(getter, names)), self._links).astype(float)
+        return np.bincount(link, list(map(getter, names)), self._links)
 
-    def _by_group(self, getter: Any) -> Floats:
-        """(G,) a count by lane group; who is before the lanes part is shared out as the traffic is."""
-        own = np.bincount(self._area_group, list(map(getter, self._areas)), self._groups)
+    def _by_group(self, counts: Sequence[int]) -> Floats:
+        """(G,) what all areas count, by lane group; who is before the lanes part is shared out as the traffic is."""
+        own = np.bincount(self._area_group, counts[: len(self._areas)], self._groups)
         if not self._before:
-            return own.astype(float)
-        before = np.bincount(self._before_link, [getter(name) for name in self._before], self._links)
+            return own
+        before = np.bincount(self._before_link, counts[len(self._areas) :], self._links)
         return np.asarray(own + before[self._group_link] * self._share)
 
 
@@ -114,12 +152,12 @@ class Sight:
     @cached_property
     def waiting_veh(self) -> Floats:
         """(G,) standing in the lane-area detectors, by lane group."""
-        return self._eyes.waiting_veh()
+        return self._eyes.waiting_veh(self.time_s)
 
     @cached_property
     def near_veh(self) -> Floats:
         """(G,) in the lane-area detectors, moving or not, by lane group."""
-        return self._eyes.near_veh()
+        return self._eyes.near_veh(self.time_s)
 
     @cached_property
     def x_veh(self) -> Floats:
