@@ -16,6 +16,8 @@ from utn_sumo.plant.heads import Heads
 
 FASTEST = 2.0
 """Nobody drives more than so many times the speed of the road."""
+LOOK_S = 2.0
+"""Looks no further apart than this follow who is in sight."""
 
 
 class Eyes:
@@ -31,10 +33,12 @@ class Eyes:
         self._areas, self._area_group = _flat(ids.group)
         self._before, self._before_link = _flat(ids.upstream)
         self._all_areas = [*self._areas, *self._before]
-        self._area_link = np.concatenate([self._group_link[self._area_group], self._before_link])
+        self._area_link = [*self._group_link[self._area_group].tolist(), *self._before_link.tolist()]
+        self._every_link = set(range(self._links))
         sight_m = np.minimum([link.length_m for link in network.links], AREA_REACH_M)
-        self._sight_s = sight_m / np.array([link.free_speed_m_s for link in network.links])
-        """(Z,) from where the lane-area detectors begin to the stop line."""
+        sight_s = sight_m / np.array([link.free_speed_m_s for link in network.links])
+        self._short = set(np.flatnonzero(sight_s <= FASTEST * LOOK_S).tolist())
+        """Links through whose lane-area detectors somebody may drive from one look to the next."""
         self._entries, self._entry_link = _flat([(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)])
         self._turn_exits = [
             [name for turn in np.flatnonzero(network.turn_link == link) for name in ids.turn[turn]]
@@ -57,17 +61,16 @@ class Eyes:
         self._left_veh = np.zeros(self._links)
         """(Z,) vehicles that had come onto each link by then, and that had left it."""
 
-        self._turned_veh = np.zeros(self._links)
-        """(Z,) vehicles that have turned off each link since the control step began, as last read."""
-        self._turned_s = -np.inf
-        """When that was."""
-        self._seen_s = -np.inf
+        self._turned_veh = [0] * self._links
+        """Vehicles that have turned off each link since the control step began, as last read."""
+        self._turned_s = self._seen_s = -np.inf
+        """When that was, and when the lane-area detectors were last looked at for who is there."""
         self._seen_veh: list[int] = []
-        """When the lane-area detectors were last looked at for who is there, and what each of them showed."""
-        self._anybody = np.ones(self._links, dtype=np.bool_)
-        """(Z,) whether then anybody was in sight on a link."""
-        self._quiet = np.zeros(self._links, dtype=np.bool_)
-        """(Z,) links that nobody can have turned off since it was read: nobody was in sight then, and nobody is now."""
+        """What each of them showed then."""
+        self._occupied = self._every_link
+        """Links on which somebody was in sight then."""
+        self._busy = self._every_link
+        """Links that somebody may have turned off since the look before: on others nobody was in sight then, or is."""
 
     def begin(self, time_s: float, x_veh: Floats) -> None:
         """A control step begins, with so many vehicles on each link (Z,)."""
@@ -77,7 +80,7 @@ class Eyes:
             self._entered_veh = self._entered_veh + self._by_link(counted, self._entries, self._entry_link)
             self._left_veh = self._left_veh + self._by_link(counted, self._exits, self._exit_link)
             self._left_veh += self._by_link(counted, self._partings, self._parting_link)
-        self._turned_veh[:] = 0.0
+        self._turned_veh = [0] * self._links
 
     def waiting_veh(self, time_s: float) -> Floats:
         """(G,) standing in the lane-area detectors."""
@@ -90,10 +93,10 @@ class Eyes:
     def near_veh(self, time_s: float) -> Floats:
         """(G,) in the lane-area detectors, moving or not."""
         self._seen_veh = list(map(self._present, self._all_areas))
-        anybody = np.bincount(self._area_link, self._seen_veh, self._links) > 0
-        self._quiet = (self._sight_s > FASTEST * (time_s - self._seen_s)) & ~(anybody | self._anybody)
-        self._quiet &= self._turned_s == self._seen_s
-        self._anybody, self._seen_s = anybody, time_s
+        occupied = {link for link, veh in zip(self._area_link, self._seen_veh, strict=True) if veh}
+        followed = self._turned_s == self._seen_s >= time_s - LOOK_S
+        self._busy = occupied | self._occupied | self._short if followed else self._every_link
+        self._occupied, self._seen_s = occupied, time_s
         return self._by_group(self._seen_veh)
 
     def crossed_veh(self, time_s: float) -> tuple[Floats, Floats]:
@@ -102,10 +105,12 @@ class Eyes:
         if time_s % self._step_s == 0:
             return np.zeros(self._links), np.zeros(self._links)
         entered = self._by_link(self._counted, self._entries, self._entry_link)
-        busy = ~self._quiet if time_s == self._seen_s else np.ones(self._links, dtype=np.bool_)
-        for link in busy.nonzero()[0].tolist():
+        for link in self._busy if time_s == self._seen_s else self._every_link:
             self._turned_veh[link] = sum(map(self._counted, self._turn_exits[link]))
-        return entered, self._turned_veh + self._by_link(self._counted, self._partings, self._parting_link)
+        left = np.array(self._turned_veh, dtype=float)
+        if self._partings:
+            left += self._by_link(self._counted, self._partings, self._parting_link)
+        return entered, left
 
     def total_veh(self, crossed_veh: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
         """The same since the run began."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from heapq import heappop, heappush
+from itertools import count
 
 import numpy as np
 
@@ -37,8 +39,9 @@ class Heads:
         """When it is looked again who waits."""
         self._overdue: list[int] = []
         """Stages that somebody has waited for too long, the longest last."""
-        self._due: list[list[tuple[float, str]]] = [[] for _ in network.junctions]
-        """(time, letters) still to be shown, by junction."""
+        self._due: list[tuple[float, int, int, str]] = []
+        """A heap of (time, junction, number, letters) still to be shown."""
+        self._numbers = count()
         self.next_s = np.inf
         """When the next letters are due."""
         self._served = np.sign(network.serves.astype(float) @ _turn_groups(network))
@@ -57,10 +60,10 @@ class Heads:
         """Show the letters that are due by now."""
         if now_s < self.next_s:
             return
-        for index, due in enumerate(self._due):
-            while due and due[0][0] <= now_s:
-                self._show(index, due.pop(0)[1])
-        self.next_s = min((due[0][0] for due in self._due if due), default=np.inf)
+        while self._due and self._due[0][0] <= now_s:
+            _, index, _, letters = heappop(self._due)
+            self._show(index, letters)
+        self.next_s = self._due[0][0] if self._due else np.inf
 
     def free(self, now_s: float) -> Bools:
         """(J,) junctions whose stage has had its least green: they may go on to another."""
@@ -72,9 +75,10 @@ class Heads:
             called = self._walked | (self._served @ view.waiting_veh > 0)
             called[view.stage] = False
             self._called_s[~called] = view.time_s
-            waited_s = view.time_s - self._called_s
-            late = np.flatnonzero(waited_s >= MOST_PATIENCE_S)
-            self._overdue = sorted(late.tolist(), key=lambda stage: waited_s[stage])
+            self._overdue = []
+            if self._called_s.min() <= view.time_s - MOST_PATIENCE_S:
+                late = np.flatnonzero(self._called_s <= view.time_s - MOST_PATIENCE_S)
+                self._overdue = sorted(late.tolist(), key=lambda stage: -self._called_s[stage])
             self._look_s = view.time_s + LOOK_S
         if not self._overdue:
             return wish
@@ -89,15 +93,14 @@ class Heads:
         if (first, stage) not in self._ways:
             junction = self.network.junctions[index]
             self._ways[first, stage] = clearances.between(self.network, junction, self._times[index], first, stage)
-        at_s, due = now_s, []
+        at_s = now_s
         for state, seconds in self._ways[first, stage]:
-            due.append((at_s, state))
+            heappush(self._due, (at_s, index, next(self._numbers), state))
             at_s += seconds
-        due.append((at_s, self.network.stages[stage].state))
-        self._due[index] = due
+        heappush(self._due, (at_s, index, next(self._numbers), self.network.stages[stage].state))
         self.stage[index], self.begin_s[index] = stage, at_s
         self._ready_s[index] = at_s + self.network.stages[stage].least_green_s
-        self.next_s = min(self.next_s, due[0][0])
+        self.next_s = now_s
         self.advance(now_s)
 
 

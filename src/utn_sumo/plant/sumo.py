@@ -102,6 +102,7 @@ class SumoPlant:
         self._entered: list[tuple[float, Floats]] = []
         """(time, what the entry loops have counted since the control step began) at each reading."""
         self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
+        self._junctions = np.arange(len(network.junctions))
         self._execution = execution
         self._heads = Heads(network, self._show)
         self._eyes: Any = None
@@ -262,7 +263,7 @@ class SumoPlant:
                 view = Sight(self._eyes, heads, self.time_s, free)
                 wish = heads.patient(self._wish(execution, view), view)
                 if wish is not view.stage:
-                    for index in np.flatnonzero(free & (wish != heads.stage)).tolist():
+                    for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
                         heads.switch(index, int(wish[index]), self.time_s)
             self._decision_s += execution.every_s
         self.decision_time_s += time.perf_counter() - started
@@ -282,9 +283,7 @@ class SumoPlant:
             wish = np.asarray(execution.wish(view))
             if wish is view.stage:
                 return wish
-            if wish.shape != view.stage.shape or any(
-                self.network.stages[wish[index]].junction != index for index in (wish != view.stage).nonzero()[0]
-            ):
+            if wish.shape != view.stage.shape or (self.network.stage_junction[wish] != self._junctions).any():
                 raise PlanError(f"{wish.tolist()} is no stage for each junction")  # noqa: TRY301 - one way out
         except Exception as error:  # noqa: BLE001 - a foreign execution may raise anything
             self._failed(error)
