@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -49,12 +49,14 @@ class Crossing:
         worth: object = 1.0,
         soon: Floats | None = None,
         free: bool = True,
+        plan: Ints | None = None,
         sent: Floats | None = None,
     ) -> tuple[int, Floats]:
-        """The stage led to, and (N, K) what is sent off."""
+        """The stage led to, and (N, K) what is sent off; `plan` is the schedule of the bin before."""
         stages = len(self.clearance)
         place = np.arange(stages)
         follows = place == ((place + 1) % stages)[:, None] if self.cyclic else np.ones((stages, stages), dtype=bool)
+        plan = np.zeros(self.bins, dtype=np.int64) if plan is None else plan
         sent = np.zeros((stages, self.bins)) if sent is None else sent.copy()
         wish = schedules(
             np.array([stage]),
@@ -72,6 +74,7 @@ class Crossing:
             np.zeros(4) if soon is None else soon,
             np.zeros(stages) + np.array(worth, dtype=float),
             np.zeros(stages) + np.array(most, dtype=float),
+            plan[None].copy(),
             sent,
         )
         return int(wish[0]), sent
@@ -119,8 +122,51 @@ def waited(shown: list[int], stand: list[float], come: list[list[float]], worth:
     return total
 
 
+Drawn = tuple[Crossing, list[float], list[list[float]], list[float], float]
+
+
+def a_bin(stage: int, place: int, queue: Floats, drawn: Drawn, soon: Floats) -> tuple[float, Floats]:
+    """What is waited in a bin, with those who brake before red, and the queues behind it."""
+    _, _, come, worth, most = drawn
+    queue, cost = queue + np.array(come)[:, place], 0.0
+    for stream in range(2):
+        if stream == stage:
+            queue[stream] = max(queue[stream] - most, 0.0)
+        else:
+            ahead = come[stream][place + 1 : place + 1 + len(soon)]
+            cost += worth[stream] * float(soon[: len(ahead)] @ ahead)
+    return cost + float(np.array(worth) @ queue), queue
+
+
+def plainly(drawn: Drawn, soon: Floats, rest: int) -> tuple[set[int], float]:
+    """The same programme, each bin gone through anew for each way: what may be led to first, and the least cost."""
+    crossing, stand = drawn[0], np.array(drawn[1])
+    bins, ends = crossing.bins, list[tuple[float, int]]()
+    # (begin, stage): cost, queues, the stage led to in the first bin.
+    states = {(0, 0): (0.0, stand, 0)}
+    for begin, stage in np.ndindex(bins, 2):
+        spent, queue, first = states.get((begin, stage), (np.inf, stand, 0))
+        last = bins if begin else min(rest, bins)
+        for now in range(begin, last + 1):
+            if now == bins:
+                ends.append((spent, first))
+            elif now >= (begin + crossing.least[stage] if begin else 0):
+                until, cleared, opens = spent, queue, min(now + crossing.clearance[stage], bins)
+                for place in range(now, opens):
+                    cost, cleared = a_bin(-1, place, cleared, drawn, soon)
+                    until += cost
+                if until < states.get((opens, 1 - stage), (np.inf,))[0] - 1e-9:
+                    states[opens, 1 - stage] = until, cleared, 1 - stage if now == 0 else first
+            if now < last:
+                cost, queue = a_bin(stage, now, queue, drawn, soon)
+                spent += cost
+    ends += [(cost, first) for (begin, _), (cost, _, first) in states.items() if begin == bins]
+    least = min(ends, key=lambda end: end[0])[0]
+    return {first for cost, first in ends if cost <= least + 1e-9}, least
+
+
 @st.composite
-def junctions(draw: st.DrawFn) -> tuple[Crossing, list[float], list[list[float]], list[float], float]:
+def junctions(draw: st.DrawFn) -> Drawn:
     """Two stages, who stands and comes, how much each is worth, and what leaves in a bin."""
     few = st.integers(1, 2)
     crossing = Crossing((draw(few), draw(few)), (draw(few), draw(few)), draw(st.integers(8, 10)))
@@ -133,9 +179,7 @@ def junctions(draw: st.DrawFn) -> tuple[Crossing, list[float], list[list[float]]
 
 class TestProgramme:
     @given(drawn=junctions())
-    def test_it_waits_hardly_more_than_the_best_of_all_sequences(
-        self, drawn: tuple[Crossing, list[float], list[list[float]], list[float], float]
-    ) -> None:
+    def test_it_waits_hardly_more_than_the_best_of_all_sequences(self, drawn: Drawn) -> None:
         crossing, stand, come, worth, most = drawn
         wish, sent = crossing.decide(stand, np.array(come), worth=worth, most=most)
         every = [(waited(shown, stand, come, worth, most), shown) for shown in every_sequence(crossing)]
@@ -149,7 +193,7 @@ class TestProgramme:
     @given(drawn=junctions(), stage=st.integers(0, 1), rest=st.integers(0, 10))
     def test_nobody_is_sent_off_who_has_not_come_and_nobody_faster_than_the_green_lets_them(
         self,
-        drawn: tuple[Crossing, list[float], list[list[float]], list[float], float],
+        drawn: Drawn,
         stage: int,
         rest: int,
     ) -> None:
@@ -160,6 +204,39 @@ class TestProgramme:
         assert (np.cumsum(sent, axis=1) <= np.array(stand)[:, None] + np.cumsum(come, axis=1) + 1e-9).all()
         # Never two that cross in one bin.
         assert (np.minimum(sent[0], sent[1]) <= 1e-9).all()
+
+    @given(drawn=junctions(), stage=st.integers(0, 1), rest=st.integers(0, 10), data=st.data())
+    def test_whatever_the_last_schedule_was_the_next_is_the_same(
+        self,
+        drawn: Drawn,
+        stage: int,
+        rest: int,
+        data: st.DataObject,
+    ) -> None:
+        """It bounds the search: one that is better than any the search finds must not leave it empty-handed."""
+        crossing, stand, come, worth, most = drawn
+        shown = st.lists(st.integers(-1, 1), min_size=crossing.bins, max_size=crossing.bins)
+        last = data.draw(st.one_of(shown, st.sampled_from(list(every_sequence(crossing)))))
+        given_now = {"stage": stage, "rest": rest, "worth": worth, "most": most}
+        wish, sent = crossing.decide(stand, np.array(come), **given_now)
+        other_wish, other_sent = crossing.decide(stand, np.array(come), plan=np.array(last), **given_now)
+        assert other_wish == wish
+        assert (other_sent == sent).all()
+
+    @given(drawn=junctions(), rest=st.integers(0, 10), soon=st.sampled_from([0.0, 0.3, 2.0]))
+    def test_it_finds_what_the_programme_finds_without_sums_and_bounds(
+        self, drawn: Drawn, rest: int, soon: float
+    ) -> None:
+        crossing, stand, come, worth, most = drawn
+        assume(stand[1] + sum(come[1]) > 0)
+        slowing = np.array([soon, soon / 2])
+        wish, sent = crossing.decide(stand, np.array(come), rest=rest, worth=worth, most=most, soon=slowing)
+        found, cost = plainly(drawn, slowing, rest)
+        left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
+        planned = float(np.array(worth) @ left_veh.sum(axis=1))
+        assert wish in found
+        assert planned <= cost + 1e-6
+        assert soon or planned == pytest.approx(cost, abs=1e-6)
 
     def test_with_nobody_anywhere_the_present_stage_stays(self) -> None:
         for stage in range(3):

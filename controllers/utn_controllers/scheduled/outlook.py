@@ -66,9 +66,9 @@ class Outlook:
         self._group_share = self.network.group_shares(fraction)
 
     def look(self, view: Seen) -> tuple[Floats, Floats]:
-        """(N,) vehicles that stand or are about to, (N, K) those that arrive in each bin; 0 where a junction is not free.
+        """(N,) vehicles that stand or are about to, (N, K) those that arrive in each bin. A bin has gone by since.
 
-        A bin has gone by since the last look.
+        Before junctions that are not free, who decide nothing now, there are none.
         """
         self._now = (self._now + 1) % self._came.shape[1]
         streams, network = self.streams, self.network
@@ -127,20 +127,11 @@ def _look(
     bin_s: float,
 ) -> tuple[Floats, Floats]:
     links, bins = len(x), sent.shape[1]
-    in_sight = np.zeros(links)
-    for group in range(len(near)):
-        in_sight[group_link[group]] += near[group]
-    asked = np.empty(links, np.bool_)
-    for link in range(links):
-        for row, until_now in enumerate((entered[link], left[link] + in_sight[link])):
-            came[row, now, link] = max(until_now - before[row, link], 0.0)
-            before[row, link] = until_now
-        asked[link] = free[junction[link]]
+    in_sight = _note(near, entered, left, group_link, before, came[:, now])
+    asked = free[junction]
     coming = np.zeros((links, bins))
     on_way, jammed = np.zeros(links), np.zeros(links)
-    for link in range(links):
-        if not asked[link]:
-            continue
+    for link in np.flatnonzero(asked):
         # In sight are those who came into it last.
         late = _arrive(came[1, :, link], now, in_sight[link], 0.0, sight_s[link], coming[link], bin_s)
         on_way[link] = in_sight[link] - late
@@ -165,6 +156,19 @@ def _look(
         for place in range(bins):
             come[stream, place] = coming[link, place] * of_link[stream]
     return stand, come
+
+
+@compiled
+def _note(near: Floats, entered: Floats, left: Floats, group_link: Ints, before: Floats, came: Floats) -> Floats:
+    """(Z,) who is in sight on each link; `came` (2, Z) is given who has come since `before`, which is given all."""
+    in_sight = np.zeros(len(left))
+    for group in range(len(near)):
+        in_sight[group_link[group]] += near[group]
+    for link in range(len(left)):
+        for row, until_now in enumerate((entered[link], left[link] + in_sight[link])):
+            came[row, link] = max(until_now - before[row, link], 0.0)
+            before[row, link] = until_now
+    return in_sight
 
 
 @compiled

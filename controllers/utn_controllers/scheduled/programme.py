@@ -2,9 +2,9 @@
 
 Forward over the bins, as COP (Sen and Head 1997). A state is a stage that begins in a bin; of two ways that lead to
 it, the one on which less has been waited goes on, with the queues that it leaves. From there the stage may last until
-any later bin. Whoever has red only adds to their queue, so that what they wait is a difference of sums made once;
-bin by bin go only those who have green. A way on which more has been waited, or will have been at the least, than on
-another that is known to its end is left.
+any later bin. Of those who have red nobody leaves, so that what they wait is a difference of sums made once; bin by
+bin go only those who have green. A way is left on which more has been waited than on another to its end, at first than
+by the schedule of the bin before.
 """
 
 from __future__ import annotations
@@ -86,20 +86,9 @@ def schedules(
 
 @compiled
 def _schedule(
-    present: int,
-    rest: int,
-    follows: Bools,
-    serves: Bools,
-    clearance: Ints,
-    least: Ints,
-    stand: Floats,
-    come: Floats,
-    soon: Floats,
-    worth: Floats,
-    most: Floats,
-    plan: Ints,
-    sent: Floats,
-) -> int:
+    present: int, rest: int, follows: Bools, serves: Bools, clearance: Ints, least: Ints, stand: Floats, come: Floats,
+    soon: Floats, worth: Floats, most: Floats, plan: Ints, sent: Floats,
+) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays; all counted within it."""
     chosen = present
     called = _called(present, follows, serves, stand, come)
@@ -138,26 +127,12 @@ def _called(present: int, follows: Bools, serves: Bools, stand: Floats, come: Fl
 
 
 @compiled
-def _search(  # noqa: C901 - one search, all in one place for the compiler
-    present: int,
-    rest: int,
-    called: Bools,
-    follows: Bools,
-    serves: Bools,
-    clearance: Ints,
-    least: Ints,
-    stand: Floats,
-    come: Floats,
-    came: Floats,
-    grown: Floats,
-    paid: Floats,
-    worth: Floats,
-    most: Floats,
-    limit: float,
-    plan: Ints,
-) -> int:
+def _search(  # noqa: C901, PLR0912 - one search, all in one place for the compiler
+    present: int, rest: int, called: Bools, follows: Bools, serves: Bools, clearance: Ints, least: Ints, stand: Floats,
+    come: Floats, came: Floats, grown: Floats, paid: Floats, worth: Floats, most: Floats, limit: float, plan: Ints,
+) -> int:  # fmt: skip
     """The stage that is led to in the first bin, and into `plan` (K,) that of each; -1 if all costs `limit` or more."""
-    stages, streams, bins = len(serves), len(stand), len(plan)
+    (stages, streams), bins, red = serves.shape, len(plan), len(serves)
     # The state: the stage that begins and when; for each the least cost until then, the queues, and whence.
     cost = np.full((bins + 1, stages), NEVER)
     queue = np.empty((bins, stages, streams))
@@ -165,8 +140,9 @@ def _search(  # noqa: C901 - one search, all in one place for the compiler
     whence = np.zeros((bins + 1, stages, 3), np.int64)
     cost[0, present] = 0.0
     queue[0, present] = stand
-    best, last_begin, last_stage = limit, -1, present
-    others, green, veh = np.empty(stages, np.int64), np.empty(streams, np.int64), np.empty(streams)
+    best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
+    after = follows[:, :stages] & called & ~np.eye(stages, dtype=np.bool_)
+    green, veh = np.empty(streams, np.int64), np.empty(streams)
     for begin in range(bins):
         for stage in range(stages):
             spent = cost[begin, stage]
@@ -174,12 +150,8 @@ def _search(  # noqa: C901 - one search, all in one place for the compiler
                 continue
             if begin > 0:
                 _lead(begin, stage, whence, serves, come, came, most, queue)
-            count = 0
-            for other in range(stages):
-                if other != stage and called[other] and follows[stage, other]:
-                    others[count] = other
-                    count += 1
-            greens, held, held_most, moving = 0, 0.0, 0.0, 0.0
+            # What the queues weigh that move, and that have red.
+            greens, moving, held = 0, 0.0, 0.0
             for stream in range(streams):
                 weight = worth[stream] * queue[begin, stage, stream]
                 if serves[stage, stream]:
@@ -188,70 +160,86 @@ def _search(  # noqa: C901 - one search, all in one place for the compiler
                     moving += weight
                 else:
                     held += weight
-                    held_most += worth[stream] * most[stream]
             may_end = begin + least[stage] if begin > 0 else 0
             must_end = rest if begin == 0 else bins
             now = begin
-            while now < bins:
-                # It ends here or later: others begin after its clearance, where that is the best way there.
-                opens = min(max(now, may_end) + clearance[stage], bins)
-                least_held = held + grown[stage, opens] - grown[stage, now]
-                if spent + paid[stage, opens] - paid[stage, now] + (opens - now) * (held - grown[stage, now]) + _drained(least_held, held_most, bins - opens) >= best - ALIKE:
-                    break
+            while now < bins and spent < best - ALIKE:
                 if now >= may_end:
-                    until = spent + paid[stages, opens] - paid[stages, now] + (opens - now) * (held + moving - grown[stages, now])
-                    for place in range(count):
-                        other = others[place]
-                        if until < cost[opens, other] - ALIKE:
+                    # It ends here: others begin after its clearance, where that is the best way there.
+                    opens = min(now + clearance[stage], bins)
+                    until = spent + _held(red, grown, paid, now, opens, held + moving)
+                    for other in range(stages):
+                        if after[stage, other] and until < cost[opens, other] - ALIKE:
                             cost[opens, other] = until
                             whence[opens, other, 0] = begin
                             whence[opens, other, 1] = stage
                             whence[opens, other, 2] = now
                     if now >= must_end:
                         break
-                spent += held + paid[stage, now + 1] - paid[stage, now] - grown[stage, now]
+                spent += _held(stage, grown, paid, now, now + 1, held)
                 held += grown[stage, now + 1] - grown[stage, now]
                 moving = 0.0
                 for place in range(greens):
                     stream = green[place]
                     veh[place] = max(veh[place] + come[stream, now] - most[stream], 0.0)
                     moving += worth[stream] * veh[place]
-                spent += moving
-                now += 1
+                spent, now = spent + moving, now + 1
             if now == bins and spent < best - ALIKE:
                 best, last_begin, last_stage = spent, begin, stage
     for stage in range(stages):
         # Ways that end amid a clearance.
         if cost[bins, stage] < best - ALIKE:
             best, last_begin, last_stage = cost[bins, stage], bins, stage
-    return _trace(present, last_begin, last_stage, whence, plan) if last_begin >= 0 else -1
+    return int(_trace(present, last_begin, last_stage, whence, plan)) if last_begin >= 0 else -1
 
 
 @compiled
 def _sums(serves: Bools, come: Floats, soon: Floats, worth: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """What the costs of red are made of, all but the last of it up to each bin and no further.
 
-    (N, K + 1) who has come; for each stage, and last for clearances, (stages + 1, K + 1) what those who have red in
-    it weigh who have come, and what would be waited in red if nobody had stood before. (N, K) what is lost in a bin of
-    red by those who come soon.
+    (N, K + 1) who has come. For each stage, and last for clearances, (stages + 1, K + 1) what those weigh who have red
+    in it and have come, and what they have waited, if nobody had stood before. (N, K) what those lose in a bin of red
+    who come soon.
     """
     stages, (streams, bins) = len(serves), come.shape
-    came = np.zeros((streams, bins + 1))
+    came, slowed = np.zeros((streams, bins + 1)), np.zeros((streams, bins))
     grown, paid = np.zeros((stages + 1, bins + 1)), np.zeros((stages + 1, bins + 1))
-    slowed = np.zeros((streams, bins))
     for stream in range(streams):
         for place in range(bins):
             came[stream, place + 1] = came[stream, place] + come[stream, place]
-            for ahead in range(min(len(soon), bins - 1 - place)):
+        for ahead in range(min(len(soon), bins)):
+            for place in range(bins - 1 - ahead):
                 slowed[stream, place] += soon[ahead] * come[stream, place + 1 + ahead]
         for stage in range(stages + 1):
             if stage == stages or not serves[stage, stream]:
-                waited = 0.0
                 for place in range(bins):
-                    waited += worth[stream] * (came[stream, place + 1] + slowed[stream, place])
                     grown[stage, place + 1] += worth[stream] * came[stream, place + 1]
-                    paid[stage, place + 1] += waited
+                    paid[stage, place + 1] += worth[stream] * (came[stream, place + 1] + slowed[stream, place])
+    for stage in range(stages + 1):
+        for place in range(bins):
+            paid[stage, place + 1] += paid[stage, place]
     return came, grown, paid, slowed
+
+
+@compiled
+def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weight: float) -> float:
+    """What those wait in some bins who have red in a stage, and of whom so much stood before."""
+    return float(paid[stage, until] - paid[stage, since] + (until - since) * (weight - grown[stage, since]))
+
+
+@compiled
+def _lead(
+    begin: int, stage: int, whence: Ints, serves: Bools, come: Floats, came: Floats, most: Floats, queue: Floats
+) -> None:
+    """Fills in the queues when a stage begins, by those when the stage before it did."""
+    before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
+    for stream in range(len(most)):
+        veh, since = queue[before, was, stream], before
+        if serves[was, stream]:
+            for place in range(before, end):
+                veh = max(veh + come[stream, place] - most[stream], 0.0)
+            since = end
+        queue[begin, stage, stream] = veh + came[stream, begin] - came[stream, since]
 
 
 @compiled
@@ -271,35 +259,6 @@ def _waited(
             waited += veh
         total += worth[stream] * waited
     return total
-
-
-@compiled
-def _red(grown: Floats, paid: Floats, stage: int, since: int, until: int, held: float) -> float:
-    """What those wait in some bins who have red then, and of whom so much stood before."""
-    return paid[stage, until] - paid[stage, since] + (until - since) * (held - grown[stage, since])
-
-
-@compiled
-def _lead(
-    begin: int, stage: int, whence: Ints, serves: Bools, come: Floats, came: Floats, most: Floats, queue: Floats
-) -> None:
-    """Fills the queues when a stage begins by those when the stage before it did."""
-    before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
-    for stream in range(len(most)):
-        veh, since = queue[before, was, stream], before
-        if serves[was, stream]:
-            for place in range(before, end):
-                veh = max(veh + come[stream, place] - most[stream], 0.0)
-            since = end
-        queue[begin, stage, stream] = veh + came[stream, begin] - came[stream, since]
-
-
-@compiled
-def _drained(veh: float, most: float, bins: int) -> float:
-    """What a queue waits at the least in so many bins while it leaves and nobody comes."""
-    if veh >= most * bins:
-        return bins * veh - most * (bins * (bins + 1) / 2)
-    return veh * (veh / most - 1) / 2
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""What the detectors show at one moment, each read when somebody asks for it, and if it can have changed."""
+"""What the detectors show at one moment, each read when somebody asks for it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from utn_sumo.contract import AREA_REACH_M, Bools, Floats, Ints, Network
+from utn_sumo.contract import Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.heads import Heads
-
-
-FASTEST = 2.0
-"""Nobody drives more than so many times the speed of the road."""
-LOOK_S = 2.0
-"""Looks no further apart than this follow who is in sight."""
 
 
 class Eyes:
@@ -33,19 +27,12 @@ class Eyes:
         self._areas, self._area_group = _flat(ids.group)
         self._before, self._before_link = _flat(ids.upstream)
         self._all_areas = [*self._areas, *self._before]
-        self._area_link = [*self._group_link[self._area_group].tolist(), *self._before_link.tolist()]
-        self._every_link = set(range(self._links))
-        sight_m = np.minimum([link.length_m for link in network.links], AREA_REACH_M)
-        sight_s = sight_m / np.array([link.free_speed_m_s for link in network.links])
-        self._short = set(np.flatnonzero(sight_s <= FASTEST * LOOK_S).tolist())
-        """Links through whose lane-area detectors somebody may drive from one look to the next."""
         self._entries, self._entry_link = _flat([(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)])
-        self._turn_exits = [
+        turn_exits = [
             [name for turn in np.flatnonzero(network.turn_link == link) for name in ids.turn[turn]]
             for link in range(self._links)
         ]
-        self._exits, self._exit_link = _flat(self._turn_exits)
-        self._partings, self._parting_link = _flat(ids.parting)
+        self._exits, self._exit_link = _flat([(*a, *b) for a, b in zip(turn_exits, ids.parting, strict=True)])
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
@@ -60,27 +47,16 @@ class Eyes:
         self._entered_veh = np.zeros(self._links)
         self._left_veh = np.zeros(self._links)
         """(Z,) vehicles that had come onto each link by then, and that had left it."""
-
-        self._turned_veh = [0] * self._links
-        """Vehicles that have turned off each link since the control step began, as last read."""
-        self._turned_s = self._seen_s = -np.inf
-        """When that was, and when the lane-area detectors were last looked at for who is there."""
+        self._seen_s = -np.inf
         self._seen_veh: list[int] = []
-        """What each of them showed then."""
-        self._occupied = self._every_link
-        """Links on which somebody was in sight then."""
-        self._busy = self._every_link
-        """Links that somebody may have turned off since the look before: on others nobody was in sight then, or is."""
+        """When the lane-area detectors were last looked at for who is there, and what each of them showed."""
 
     def begin(self, time_s: float, x_veh: Floats) -> None:
         """A control step begins, with so many vehicles on each link (Z,)."""
         self._x_veh = x_veh
         if time_s > 0:
-            counted = self._counted_last
-            self._entered_veh = self._entered_veh + self._by_link(counted, self._entries, self._entry_link)
-            self._left_veh = self._left_veh + self._by_link(counted, self._exits, self._exit_link)
-            self._left_veh += self._by_link(counted, self._partings, self._parting_link)
-        self._turned_veh = [0] * self._links
+            self._entered_veh = self._entered_veh + self._by_link(self._counted_last, self._entries, self._entry_link)
+            self._left_veh = self._left_veh + self._by_link(self._counted_last, self._exits, self._exit_link)
 
     def waiting_veh(self, time_s: float) -> Floats:
         """(G,) standing in the lane-area detectors."""
@@ -93,24 +69,15 @@ class Eyes:
     def near_veh(self, time_s: float) -> Floats:
         """(G,) in the lane-area detectors, moving or not."""
         self._seen_veh = list(map(self._present, self._all_areas))
-        occupied = {link for link, veh in zip(self._area_link, self._seen_veh, strict=True) if veh}
-        followed = self._turned_s == self._seen_s >= time_s - LOOK_S
-        self._busy = occupied | self._occupied | self._short if followed else self._every_link
-        self._occupied, self._seen_s = occupied, time_s
+        self._seen_s = time_s
         return self._by_group(self._seen_veh)
 
     def crossed_veh(self, time_s: float) -> tuple[Floats, Floats]:
         """(Z,) that have come onto each link since the control step began, and (Z,) that have left it."""
-        self._turned_s = time_s
         if time_s % self._step_s == 0:
             return np.zeros(self._links), np.zeros(self._links)
         entered = self._by_link(self._counted, self._entries, self._entry_link)
-        for link in self._busy if time_s == self._seen_s else self._every_link:
-            self._turned_veh[link] = sum(map(self._counted, self._turn_exits[link]))
-        left = np.array(self._turned_veh, dtype=float)
-        if self._partings:
-            left += self._by_link(self._counted, self._partings, self._parting_link)
-        return entered, left
+        return entered, self._by_link(self._counted, self._exits, self._exit_link)
 
     def total_veh(self, crossed_veh: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
         """The same since the run began."""
@@ -131,11 +98,11 @@ class Eyes:
         return float(min(map(self._since_s, self._group_stop_line[group])))
 
     def _by_link(self, getter: Any, names: Sequence[str], link: Ints) -> Floats:
-        return np.bincount(link, list(map(getter, names)), self._links)
+        return np.asarray(np.bincount(link, list(map(getter, names)), self._links), dtype=float)
 
     def _by_group(self, counts: Sequence[int]) -> Floats:
         """(G,) what all areas count, by lane group; who is before the lanes part is shared out as the traffic is."""
-        own = np.bincount(self._area_group, counts[: len(self._areas)], self._groups)
+        own = np.asarray(np.bincount(self._area_group, counts[: len(self._areas)], self._groups), dtype=float)
         if not self._before:
             return own
         before = np.bincount(self._before_link, counts[len(self._areas) :], self._links)
