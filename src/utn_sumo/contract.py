@@ -26,6 +26,8 @@ MOST_CYCLES = 3
 """Longest cycles between two decisions that junctions with different cycles make necessary."""
 AREA_REACH_M = 200.0
 """Lane-area detectors see this far upstream of the stop line: the reach of a camera on the mast."""
+ZONES_M = (22.0, 50.0, 100.0, AREA_REACH_M)
+"""How far from the stop line the zones end in which they say where vehicles are: the nearer the finer."""
 SAMPLE_S = 10.0
 """Longest time between two readings of the entry loops (the paper's sampling interval)."""
 
@@ -591,6 +593,11 @@ class View(Protocol):
     @property
     def near_veh(self) -> Floats:
         """(G,) in the lane-area detectors, moving or not, by lane group."""
+        ...
+
+    @property
+    def zone_veh(self) -> Floats:
+        """(G, zones) vehicles by lane group and by how far they are from the stop line (`ZONES_M`)."""
         ...
 
     @property

@@ -12,12 +12,10 @@ from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network, Plan, State, View
+from utn_sumo.contract import EXIT, ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
 
 BIN_S = 2.0
 """Length of a bin, and time between two decisions."""
-BACK_S = 1.0
-"""What of a clearance is not lost: the yellow is driven on for longer than the next queue takes to start."""
 SOON_FADING = np.array([1.0, 0.9, 0.81, 0.73])
 """What a vehicle loses by red in each bin before its arrival, over the last one's."""
 LEAST_WORTH = 0.05
@@ -39,10 +37,8 @@ class ScheduledSettings(BaseModel):
     """How far ahead a schedule goes [s]."""
     discharge: float = Field(1.4, gt=0, le=3)
     """Over the saturation flow, which is that of long queues with their start: what a queue leaves with."""
-    early_s: float = Field(2.5, ge=0, le=20)
-    """How long before it reaches the stop line a vehicle has to see green [s]."""
     slowing_s: float = Field(0.3, ge=0, le=20)
-    """What it loses by each two seconds of red before that [s]."""
+    """What a vehicle loses by each two seconds of red before it reaches the stop line [s]."""
     crowding: float = Field(0.4, ge=0, le=20)
     """By how much waiting on a full link costs more than on an empty one, in vehicles."""
     full: float = Field(0.5, gt=0, le=2)
@@ -60,9 +56,9 @@ class Scheduled:
         self.every_s = BIN_S
         self._streams = Streams(network)
         bins = round(self.settings.horizon_s / BIN_S)
-        self._outlook = Outlook(network, self._streams, bins, BIN_S, self.settings.early_s)
+        self._outlook = Outlook(network, self._streams, bins, BIN_S)
         stages = self._streams.stage
-        self._clearance = np.maximum(_bins(network.clearance_s[stages] - BACK_S), 1)
+        self._clearance = np.maximum(_bins(network.clearance_s[stages]), 1)
         self._least = np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64)
         self._follows = self._orders()
         self._soon = self.settings.slowing_s / BIN_S * SOON_FADING
@@ -125,7 +121,8 @@ class Scheduled:
         none = np.zeros(len(self.network.links))
         stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
-        self.wish(_Nobody(0.0, stage, begin_s, free, np.zeros(len(self.network.groups)), none, none, none))
+        zones = np.zeros((len(self.network.groups), len(ZONES_M)))
+        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none))
 
     def _take_up(self) -> None:
         flow_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]
@@ -164,10 +161,9 @@ class _Nobody:
     stage: Ints
     begin_s: Floats
     free: Bools
-    near_veh: Floats
+    zone_veh: Floats
     x_veh: Floats
     entered_veh: Floats
-    left_veh: Floats
 
 
 def _bins(seconds: Floats) -> Ints:

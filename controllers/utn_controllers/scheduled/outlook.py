@@ -8,12 +8,10 @@ import numpy as np
 
 from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import AREA_REACH_M, Bools, Floats, Ints, Network
+from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
 
 MEMORY_S = 120.0
 """Over what time the rate is taken with which vehicles come from where no schedule is known."""
-QUEUED_SHARE = 0.5
-"""Share of its jam from which what the lane-area detectors see is a queue that reaches back beyond them."""
 
 
 class Seen(Protocol):
@@ -22,74 +20,71 @@ class Seen(Protocol):
     @property
     def free(self) -> Bools: ...
     @property
-    def near_veh(self) -> Floats: ...
+    def zone_veh(self) -> Floats: ...
     @property
     def x_veh(self) -> Floats: ...
     @property
     def entered_veh(self) -> Floats: ...
-    @property
-    def left_veh(self) -> Floats: ...
 
 
 class Outlook:
-    """Keeps who has come onto each link and when, and says who arrives before its signal in each bin ahead.
+    """Says who arrives before each signal in each bin ahead, if nobody stood in their way.
 
-    Beyond those the upstream loops have counted are those whom the neighbours' schedules send, and as many more
-    as have been coming of late from elsewhere.
+    Within 200 m the detectors show where vehicles are, and so when they could be at the stop line, whether they stand
+    now or not. Farther off are those whom the upstream loops have counted, then those whom the neighbours' schedules
+    send, and as many more as have been coming of late from elsewhere.
     """
 
-    def __init__(self, network: Network, streams: Streams, bins: int, bin_s: float, early_s: float):
-        """`early_s` before it reaches the stop line a vehicle counts as arrived."""
+    def __init__(self, network: Network, streams: Streams, bins: int, bin_s: float):
         self.network = network
         self.streams = streams
         self.bin_s = bin_s
         speed_m_s = np.array([link.free_speed_m_s for link in network.links])
         length_m = np.array([link.length_m for link in network.links])
-        self._due_s = np.maximum(network.free_time_s - early_s, 0.0)
+        reach_m = np.minimum(length_m[:, None], [0.0, *ZONES_M])
+        self._arrival = _arrival(reach_m / speed_m_s[:, None] / bin_s, bins)
+        """(Z, zones, K) share of those in each zone that could arrive in each bin, but for the first zone: it is by
+        the stop line."""
+        self._due_s = network.free_time_s
         """(Z,) from entry to arrival."""
-        self._sight_s = np.maximum(np.minimum(length_m, AREA_REACH_M) / speed_m_s - early_s, 0.0)
+        self._sight_s = reach_m[:, -1] / speed_m_s
         """(Z,) from where the lane-area detectors begin to arrival."""
-        self._hidden = length_m > AREA_REACH_M
-        self._came = np.zeros((2, int(np.ceil(self._due_s.max(initial=0.0) / bin_s)) + 1, len(network.links)))
-        """Vehicles that came onto each link, and into sight on it, in each of the last bins, in a ring."""
+        self._came = np.zeros((int(np.ceil(self._due_s.max(initial=0.0) / bin_s)) + 1, len(network.links)))
+        """Vehicles that came onto each link in each of the last bins, in a ring."""
         self._now = 0
-        self._before_veh = np.zeros((2, len(network.links)))
+        self._before_veh = np.zeros(len(network.links))
         self._rate = np.zeros((2, len(network.links)))
         """Vehicles a bin that come onto each link of late, and of these those that schedules said."""
         self.sent_veh = np.zeros((len(streams.link), bins))
-        """(N, K) vehicles that each stream's schedule sends off in each bin from now on."""
+        """(N, K) vehicles that each stream's schedule sends off in each bin, from the one that it was made in on."""
         self.take_up(network.fraction)
 
     def take_up(self, fraction: Floats) -> None:
         """Go by these turning fractions (M,) from now on."""
         self.of_link, self.of_group = self.streams.shares(fraction)
-        self._group_share = self.network.group_shares(fraction)
 
     def look(self, view: Seen) -> tuple[Floats, Floats]:
-        """(N,) vehicles that stand or are about to, (N, K) those that arrive in each bin. A bin has gone by since.
+        """(N,) vehicles by the stop line, (N, K) those that could be in each bin. A bin has gone by since.
 
         Before junctions that are not free, who decide nothing now, there are none.
         """
-        self._now = (self._now + 1) % self._came.shape[1]
+        self._now = (self._now + 1) % len(self._came)
         streams, network = self.streams, self.network
         stand, come = _look(
             view.free,
-            view.near_veh,
+            view.zone_veh,
             view.x_veh,
             view.entered_veh,
-            view.left_veh,
             self._before_veh,
             self._came,
             self._now,
             self._rate,
             self.sent_veh,
+            self._arrival,
             self._due_s,
             self._sight_s,
-            network.watched_veh,
-            self._hidden,
             network.link_junction,
             network.group_link,
-            self._group_share,
             streams.link,
             streams.group,
             streams.next_link,
@@ -100,25 +95,32 @@ class Outlook:
         return stand, come
 
 
+def _arrival(reach: Floats, bins: int) -> Floats:
+    """(Z, zones, K) by where the zones of each link begin and end, (Z, zones + 1) in bins of driving to the line."""
+    edges = np.arange(bins + 1)
+    begin, end = reach[:, :-1, None], reach[:, 1:, None]
+    until = np.clip((edges - begin) / np.maximum(end - begin, 1e-9), 0.0, 1.0)
+    share = np.diff(until, axis=2)
+    share[:, 0] = 0.0
+    return np.asarray(share)
+
+
 @compiled
 def _look(
     free: Bools,
-    near: Floats,
+    zone: Floats,
     x: Floats,
     entered: Floats,
-    left: Floats,
     before: Floats,
     came: Floats,
     now: int,
     rate: Floats,
     sent: Floats,
+    arrival: Floats,
     due_s: Floats,
     sight_s: Floats,
-    seen_jam: Floats,
-    hidden: Bools,
     junction: Ints,
     group_link: Ints,
-    group_share: Floats,
     stream_link: Ints,
     stream_group: Ints,
     next_link: Ints,
@@ -127,66 +129,48 @@ def _look(
     bin_s: float,
 ) -> tuple[Floats, Floats]:
     links, bins = len(x), sent.shape[1]
-    in_sight = _note(near, entered, left, group_link, before, came[:, now])
     asked = free[junction]
+    far = x.copy()
+    for group in range(len(zone)):
+        far[group_link[group]] -= zone[group].sum()
     coming = np.zeros((links, bins))
-    on_way, jammed = np.zeros(links), np.zeros(links)
-    for link in np.flatnonzero(asked):
-        # In sight are those who came into it last.
-        late = _arrive(came[1, :, link], now, in_sight[link], 0.0, sight_s[link], coming[link], bin_s)
-        on_way[link] = in_sight[link] - late
-        if not hidden[link]:
-            continue
-        # Before that are those who came onto the link last. Who is late is about to come into sight, or in a jam.
-        far = max(x[link] - in_sight[link], 0.0)
-        late = _arrive(came[0, :, link], now, far, sight_s[link], due_s[link], coming[link], bin_s)
-        if in_sight[link] - on_way[link] >= QUEUED_SHARE * seen_jam[link]:
-            jammed[link] = late
-        else:
-            coming[link, min(bins - 1, int(sight_s[link] / bin_s))] += late
-    _send(asked, sent, next_link, came[0, now], rate, due_s, coming, bin_s)
+    for link in range(links):
+        came[now, link] = max(entered[link] - before[link], 0.0)
+        before[link] = entered[link]
+        if asked[link] and due_s[link] > sight_s[link]:
+            _arrive(came[:, link], now, max(far[link], 0.0), sight_s[link], due_s[link], coming[link], bin_s)
+    _send(asked, sent, next_link, came[now], rate, due_s, coming, bin_s)
     stand, come = np.zeros(len(stream_link)), np.zeros((len(stream_link), bins))
     for stream in range(len(stream_link)):
         group, link = stream_group[stream], stream_link[stream]
         if not asked[link]:
             continue
-        # Who is in sight and not on the way stands, or moves in a queue.
-        queue = max(near[group] - group_share[group] * on_way[link], 0.0) + group_share[group] * jammed[link]
-        stand[stream] = queue * of_group[stream]
+        stand[stream] = of_group[stream] * zone[group, 0]
         for place in range(bins):
-            come[stream, place] = coming[link, place] * of_link[stream]
+            come[stream, place] = of_link[stream] * coming[link, place]
+        for part in range(1, zone.shape[1]):
+            if zone[group, part] > 0:
+                for place in range(bins):
+                    come[stream, place] += of_group[stream] * zone[group, part] * arrival[link, part, place]
     return stand, come
 
 
 @compiled
-def _note(near: Floats, entered: Floats, left: Floats, group_link: Ints, before: Floats, came: Floats) -> Floats:
-    """(Z,) who is in sight on each link; `came` (2, Z) is given who has come since `before`, which is given all."""
-    in_sight = np.zeros(len(left))
-    for group in range(len(near)):
-        in_sight[group_link[group]] += near[group]
-    for link in range(len(left)):
-        for row, until_now in enumerate((entered[link], left[link] + in_sight[link])):
-            came[row, link] = max(until_now - before[row, link], 0.0)
-            before[row, link] = until_now
-    return in_sight
-
-
-@compiled
-def _arrive(came: Floats, now: int, veh: float, from_s: float, due_s: float, coming: Floats, bin_s: float) -> float:
+def _arrive(came: Floats, now: int, veh: float, sight_s: float, due_s: float, coming: Floats, bin_s: float) -> None:
     """Puts the last `veh` of those who `came`, each amid the bin in which they did, where they arrive `due_s` later.
 
-    But none nearer than `from_s`: so many are left, who should have arrived.
+    Whoever should be in sight by now, in a queue or slow, is where sight begins.
     """
     for age in range(len(came)):
         left_s = due_s - (age + 0.5) * bin_s
-        if left_s <= from_s:
+        if left_s <= sight_s:
             break
         here = min(came[(now - age) % len(came)], veh)
         veh -= here
         place = int(left_s / bin_s)
         if place < len(coming):
             coming[place] += here
-    return veh
+    coming[min(int(sight_s / bin_s), len(coming) - 1)] += veh
 
 
 @compiled
@@ -212,8 +196,9 @@ def _send(
             rate[1, link] += fresh * sent[stream, 0]
             if not asked[link]:
                 continue
-            delay = int(due_s[link] / bin_s + 0.5)
-            for place in range(delay, bins):
+            # A bin of what it has planned has gone by.
+            delay = int(due_s[link] / bin_s + 0.5) - 1
+            for place in range(max(delay, 0), bins):
                 coming[link, place] += sent[stream, place - delay]
     for link in range(links):
         if not asked[link]:

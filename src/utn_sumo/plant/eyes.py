@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.heads import Heads
 
@@ -27,6 +27,9 @@ class Eyes:
         self._areas, self._area_group = _flat(ids.group)
         self._before, self._before_link = _flat(ids.upstream)
         self._all_areas = [*self._areas, *self._before]
+        self._zones, self._zone_place = _flat(list(chain.from_iterable(ids.group_zone)))
+        """Detectors of zones, and the place of each in (G, zones) that is made flat."""
+        self._before_zones, self._before_zone_place = _flat(list(chain.from_iterable(ids.upstream_zone)))
         self._entries, self._entry_link = _flat([(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)])
         turn_exits = [
             [name for turn in np.flatnonzero(network.turn_link == link) for name in ids.turn[turn]]
@@ -71,6 +74,17 @@ class Eyes:
         self._seen_veh = list(map(self._present, self._all_areas))
         self._seen_s = time_s
         return self._by_group(self._seen_veh)
+
+    def zone_veh(self) -> Floats:
+        """(G, zones) vehicles by how far they are from the stop line; who is before the lanes part is shared out."""
+        shape = len(ZONES_M)
+        own = np.bincount(self._zone_place, list(map(self._present, self._zones)), self._groups * shape)
+        own = np.asarray(own, dtype=float).reshape(self._groups, shape)
+        if not self._before_zones:
+            return own
+        veh = list(map(self._present, self._before_zones))
+        before = np.bincount(self._before_zone_place, veh, self._links * shape).reshape(self._links, shape)
+        return np.asarray(own + before[self._group_link] * self._share[:, None])
 
     def crossed_veh(self, time_s: float) -> tuple[Floats, Floats]:
         """(Z,) that have come onto each link since the control step began, and (Z,) that have left it."""
@@ -130,6 +144,11 @@ class Sight:
     def near_veh(self) -> Floats:
         """(G,) in the lane-area detectors, moving or not, by lane group."""
         return self._eyes.near_veh(self.time_s)
+
+    @cached_property
+    def zone_veh(self) -> Floats:
+        """(G, zones) vehicles by lane group and by how far they are from the stop line."""
+        return self._eyes.zone_veh()
 
     @cached_property
     def x_veh(self) -> Floats:

@@ -119,7 +119,8 @@ class SumoPlant:
         import libsumo  # noqa: PLC0415 - heavy, and only this door needs it
 
         additional = [self.folder / "detectors.add.xml", self.folder / "outputs.add.xml"]
-        detectors.write(self.network, additional[0], self.network.control_step_s)
+        within_step = self._execution is not None
+        detectors.write(self.network, additional[0], self.network.control_step_s, zones=within_step)
         write_outputs(additional[1])
         arguments = self._arguments(additional)
         started = time.perf_counter()
