@@ -12,7 +12,7 @@ Where an execution decides within the control step, more lane-area detectors cut
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -146,6 +146,15 @@ def _zones(network: Network, link: Link) -> list[tuple[str, int, float, float]]:
     return pieces
 
 
+def _areas(network: Network, link: Link, *, zones: bool) -> Iterator[tuple[str, str, float, float]]:
+    """(kind, edge, metres from its begin, to) of the lane-area detectors on each of its lanes."""
+    for edge, seen_m in _watched(network, link):
+        length_m = network.edge_length_m[edge]
+        yield "area", edge, length_m - seen_m, length_m
+    for edge, zone, from_m, to_m in _zones(network, link) if zones else ():
+        yield f"zone{zone}", edge, from_m, max(to_m - CAR_M, from_m + LEAST_M)
+
+
 def write(network: Network, path: Path, period_s: float, *, zones: bool = False) -> None:
     """Write the additional file; its detectors report every `period_s` seconds. Those of zones if they are wanted."""
     root = ET.Element("additional")
@@ -154,35 +163,23 @@ def write(network: Network, path: Path, period_s: float, *, zones: bool = False)
     def loop(name: str, lane: str, position_m: float) -> None:
         ET.SubElement(root, "inductionLoop", {"id": name, "lane": lane, "pos": f"{position_m:g}", **report})
 
+    def areas(kind: str, edge: str, from_m: float, to_m: float) -> None:
+        for lane in network.edge_lanes[edge]:
+            place = {"lane": f"{edge}_{lane}", "pos": f"{from_m:g}", "endPos": f"{to_m:g}"}
+            ET.SubElement(root, "laneAreaDetector", {"id": _named(kind, f"{edge}_{lane}"), **place, **report})
+
     for link in network.links:
         for kind, edge, position_m in (("entry", link.edges[0], ENTRY_M), ("stop", link.edges[-1], STOP_LINE_M)):
             for lane in network.edge_lanes[edge]:
                 loop(_named(kind, f"{edge}_{lane}"), f"{edge}_{lane}", position_m)
-        for watched, seen_m in _watched(network, link):
-            length_m = network.edge_length_m[watched]
-            for lane in network.edge_lanes[watched]:
-                place = {
-                    "id": _named("area", f"{watched}_{lane}"),
-                    "lane": f"{watched}_{lane}",
-                    "pos": f"{length_m - seen_m:g}",
-                    "endPos": f"{length_m:g}",
-                }
-                ET.SubElement(root, "laneAreaDetector", {**place, **report})
-        for edge, zone, from_m, to_m in _zones(network, link) if zones else ():
-            for lane in network.edge_lanes[edge]:
-                place = {
-                    "id": _named(f"zone{zone}", f"{edge}_{lane}"),
-                    "lane": f"{edge}_{lane}",
-                    "pos": f"{from_m:g}",
-                    "endPos": f"{max(to_m - CAR_M, from_m + LEAST_M):g}",
-                }
-                ET.SubElement(root, "laneAreaDetector", {**place, **report})
-    for turn in network.turns:
-        for via in turn.via_lanes:
-            loop(_named("turn", via), via, TURN_M)
+        for kind, edge, from_m, to_m in _areas(network, link, zones=zones):
+            areas(kind, edge, from_m, to_m)
+    turning = {via for turn in network.turns for via in turn.via_lanes}
     # One link's traffic may part onto another's: one loop then counts for both.
-    for via in sorted({via for link in network.links for via in (*link.joining, *link.parting)}):
-        loop(_named("side", via), via, TURN_M)
+    beside = {via for link in network.links for via in (*link.joining, *link.parting)}
+    for kind, lanes in (("turn", turning), ("side", beside)):
+        for via in sorted(lanes):
+            loop(_named(kind, via), via, TURN_M)
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
 

@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.integration import odd_nets
-from tests.unit.views import Scene, scene
+from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import AREA_REACH_M, Floats, Network
+from utn_sumo.contract import AREA_REACH_M, ZONES_M, Floats, Network
 
-BIN_S, EARLY_S, BINS = 2.0, 2.5, 25
+BIN_S, BINS = 2.0, 25
 A_BIN = 1.0
 """When in a bin somebody came is not known."""
 
@@ -29,11 +29,9 @@ class Road:
         self.network, self.link, self.red = network, link, red
         self.entered_s = np.sort(np.array(list(entered_s), dtype=float))
         self.free_s = float(network.free_time_s[link])
-        road = network.links[link]
-        self.hidden_s = max(road.length_m - AREA_REACH_M, 0.0) / road.free_speed_m_s
-        """Until they come into sight."""
+        self.speed_m_s = network.links[link].free_speed_m_s
         self.streams = Streams(network)
-        self.outlook = Outlook(network, self.streams, BINS, BIN_S, EARLY_S)
+        self.outlook = Outlook(network, self.streams, BINS, BIN_S)
         self.now_s = 0.0
         turns = network.turn_link == link
         share = np.bincount(network.turn_group, network.fraction * turns, len(network.groups))
@@ -53,15 +51,22 @@ class Road:
     def _left(self) -> int:
         return 0 if self.red else self._since(self.free_s)
 
+    def _zone_veh(self) -> Floats:
+        """(zones,) those who are on it, by the way that they still have."""
+        here_s = self.now_s - self.entered_s[(self.entered_s <= self.now_s)]
+        to_stop_m = np.maximum(self.free_s - here_s, 0.0) * self.speed_m_s
+        if not self.red:
+            to_stop_m = to_stop_m[to_stop_m > 0]
+        return np.histogram(to_stop_m, [0.0, *ZONES_M])[0].astype(float)
+
     def _view(self) -> Scene:
         one = np.zeros(len(self.network.links))
         one[self.link] = 1.0
         return replace(
             scene(self.network, self.now_s),
-            near_veh=(self._since(self.hidden_s) - self._left()) * self.group_share,
+            zone_veh=np.outer(self.group_share, self._zone_veh()),
             x_veh=self.on_it() * one,
             entered_veh=self._since(0.0) * one,
-            left_veh=self._left() * one,
         )
 
     @property
@@ -72,7 +77,7 @@ class Road:
     @property
     def due_bins(self) -> int:
         """Bins in which whoever is on it now arrives; whoever comes later arrives later."""
-        return int((self.free_s - EARLY_S) / BIN_S - 0.5) + 1
+        return int(self.free_s / BIN_S - 0.5) + 1
 
 
 @pytest.fixture(scope="module", params=["long", "short"])
@@ -100,52 +105,55 @@ def test_everybody_on_a_link_stands_or_comes(street: Network, gaps_s: list[float
 @pytest.mark.parametrize("entered_s", [0.5, 2.5, 3.9, 11.3])
 def test_a_vehicle_arrives_when_free_speed_brings_it_there(street: Network, entered_s: float) -> None:
     road = Road(street, 0, [entered_s])
+    borders_s = np.array([0.0, *ZONES_M]) / road.speed_m_s
     looks = 0
     while road.now_s < entered_s + road.free_s - BIN_S:
         stand, come = road.look()
         on_way = come[:, : road.due_bins].sum(axis=0)
-        ahead_s = road.free_s - EARLY_S - (road.now_s - entered_s)
+        ahead_s = road.free_s - (road.now_s - entered_s)
         if road.now_s < entered_s:
             assert stand.sum() + come.sum() == 0
             continue
         looks += 1
-        if on_way.sum() < 0.5:
-            # It is where it could just stop, or nearer.
+        if ahead_s < borders_s[1]:
             assert stand.sum() == pytest.approx(1.0)
-            assert ahead_s < BIN_S
         else:
+            # The nearer, the better it is known where it is.
+            zone = int(np.searchsorted(borders_s, ahead_s))
+            wide_s = borders_s[zone] - borders_s[zone - 1] if zone < len(borders_s) else 2 * A_BIN * BIN_S
             place = float(on_way @ np.arange(road.due_bins)) / on_way.sum()
-            assert place == pytest.approx(ahead_s / BIN_S - 0.5, abs=A_BIN + 0.5)
+            assert place == pytest.approx(ahead_s / BIN_S - 0.5, abs=wide_s / 2 / BIN_S + 0.5)
     assert looks > 4
 
 
-def test_who_stands_before_red_stands_by_lane_group_as_seen(utn17: Network) -> None:
+def test_who_is_by_the_line_stands_by_lane_group_as_seen(utn17: Network) -> None:
     streams = Streams(utn17)
-    outlook = Outlook(utn17, streams, BINS, BIN_S, EARLY_S)
+    outlook = Outlook(utn17, streams, BINS, BIN_S)
     near_veh = np.arange(len(utn17.groups), dtype=float)
     seen_veh = np.bincount(utn17.group_link, near_veh, len(utn17.links))
-    still = replace(scene(utn17), near_veh=near_veh, x_veh=seen_veh, entered_veh=seen_veh)
+    still = replace(scene(utn17), zone_veh=by_the_line(near_veh), x_veh=seen_veh, entered_veh=seen_veh)
     for _ in range(30):
         stand, come = outlook.look(still)
     assert np.bincount(streams.group, stand, len(utn17.groups)) == pytest.approx(near_veh)
-    near_bins = int((utn17.free_time_s.min() - EARLY_S) / BIN_S)
+    near_bins = int(utn17.free_time_s.min() / BIN_S) - 1
     assert come[:, :near_bins].sum() == pytest.approx(0.0)
 
 
-def test_a_queue_that_reaches_back_out_of_sight_stands_as_a_whole(utn17: Network) -> None:
+def test_a_queue_that_reaches_back_out_of_sight_follows_whom_the_detectors_see(utn17: Network) -> None:
     link, streams = 0, Streams(utn17)
-    outlook = Outlook(utn17, streams, BINS, BIN_S, EARLY_S)
-    storage_veh, length_m = utn17.storage_veh[link], utn17.links[link].length_m
+    outlook = Outlook(utn17, streams, BINS, BIN_S)
+    road = utn17.links[link]
+    storage_veh, ends_m = utn17.storage_veh[link], np.array([0.0, *ZONES_M])
     one = np.zeros(len(utn17.links))
     one[link] = 1.0
     groups = utn17.group_link == link
-    jam_veh = storage_veh * AREA_REACH_M / length_m
-    full = replace(
-        scene(utn17), near_veh=jam_veh * groups / groups.sum(), x_veh=storage_veh * one, entered_veh=storage_veh * one
-    )
+    zone_veh = np.outer(groups / groups.sum(), storage_veh * np.diff(ends_m) / road.length_m)
+    full = replace(scene(utn17), zone_veh=zone_veh, x_veh=storage_veh * one, entered_veh=storage_veh * one)
     for _ in range(30):
-        stand, _ = outlook.look(full)
-    assert stand.sum() == pytest.approx(storage_veh)
+        stand, come = outlook.look(full)
+    seen_bins = int(AREA_REACH_M / road.free_speed_m_s / BIN_S) + 1
+    assert stand.sum() + come[:, :seen_bins].sum() == pytest.approx(storage_veh, rel=0.01)
+    assert stand.sum() == pytest.approx(storage_veh * ZONES_M[0] / road.length_m)
 
 
 @pytest.mark.parametrize("gap_s", [4.0, 8.0])
@@ -174,7 +182,7 @@ def test_nobody_is_expected_any_more_once_they_have_stopped_coming(utn17: Networ
 def test_whom_a_neighbour_sends_arrives_after_the_way_along_the_link(utn17: Network) -> None:
     streams = Streams(utn17)
     for stream in np.flatnonzero(streams.feeds):
-        outlook = Outlook(utn17, streams, BINS, BIN_S, EARLY_S)
+        outlook = Outlook(utn17, streams, BINS, BIN_S)
         link, place = streams.next_link[stream], 4
         outlook.sent_veh[stream, place] = 3.0
         stand, come = outlook.look(scene(utn17))
@@ -182,8 +190,8 @@ def test_whom_a_neighbour_sends_arrives_after_the_way_along_the_link(utn17: Netw
         assert come.sum() == pytest.approx(3.0)
         assert come[streams.link == link].sum() == pytest.approx(3.0)
         (found,) = np.flatnonzero(come.sum(axis=0))
-        due_s = utn17.free_time_s[link] - EARLY_S
-        assert found - place == pytest.approx(due_s / BIN_S, abs=A_BIN)
+        # A bin has gone by since.
+        assert found - place + 1 == pytest.approx(utn17.free_time_s[link] / BIN_S, abs=0.5)
         share, _ = streams.shares(utn17.fraction)
         assert come[:, found] == pytest.approx(np.where(streams.link == link, 3.0 * share, 0.0))
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from tests.integration import odd_nets
-from tests.unit.views import Scene, scene
+from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.programme import schedules
@@ -416,7 +416,7 @@ def drawn(network: Network, seed: int) -> Scene:
     return replace(
         scene(network, 20.0, np.array([rng.choice(junction.stages) for junction in network.junctions])),
         free=rng.uniform(size=len(network.junctions)) < 0.8,
-        near_veh=near_veh,
+        zone_veh=by_the_line(near_veh),
         x_veh=seen_veh,
         entered_veh=seen_veh,
     )
@@ -458,7 +458,7 @@ class TestExecution:
         for bounds, leaves in (("none", False), ("plan", True)):
             execution = Scheduled(utn17, bounds=bounds)
             execution.begin(plan, Estimator(utn17, utn17).initial())
-            view = replace(scene(utn17, 500.0), near_veh=near_veh)
+            view = replace(scene(utn17, 500.0), zone_veh=by_the_line(near_veh))
             assert (execution.wish(view) != view.stage).all() == leaves
             # It has not been reached yet.
             view = replace(view, time_s=2.0)
@@ -474,7 +474,7 @@ class TestExecution:
             x_veh[ahead] = taken * utn17.storage_veh[ahead]
             near_veh = np.zeros(len(utn17.groups))
             near_veh[streams.group[stream]] = 8.0
-            execution.wish(replace(scene(utn17), near_veh=near_veh, x_veh=x_veh))
+            execution.wish(replace(scene(utn17), zone_veh=by_the_line(near_veh), x_veh=x_veh))
             assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
 
     @pytest.mark.parametrize("made", [Scheduled, Recommended])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,7 @@ class Scene:
     free: Bools
     waiting_veh: Floats
     near_veh: Floats
+    zone_veh: Floats
     x_veh: Floats
     gap_s: Floats
     entered_veh: Floats
@@ -31,6 +32,11 @@ class Scene:
         return float(self.gap_s[group])
 
 
+def by_the_line(veh: Floats) -> Floats:
+    """(G, zones) everybody of a lane group (G,) in the zone next to the stop line."""
+    return np.pad(veh[:, None], ((0, 0), (0, len(ZONES_M) - 1)))
+
+
 def scene(
     network: Network, time_s: float = 0.0, stage: Ints | None = None, *, veh: Floats | float = 0.0, gap_s: float = 0.0
 ) -> Scene:
@@ -39,13 +45,15 @@ def scene(
     Unless it is said otherwise.
     """
     groups = np.zeros(len(network.groups))
+    everybody = groups + veh
     return Scene(
         time_s,
         np.array([junction.stages[0] for junction in network.junctions]) if stage is None else stage,
         np.zeros(len(network.junctions)),
         np.ones(len(network.junctions), dtype=bool),
-        groups + veh,
-        groups + veh,
+        everybody,
+        everybody,
+        by_the_line(everybody),
         np.zeros(len(network.links)),
         groups + gap_s,
         np.zeros(len(network.links)),

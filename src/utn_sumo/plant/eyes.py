@@ -77,13 +77,10 @@ class Eyes:
 
     def zone_veh(self) -> Floats:
         """(G, zones) vehicles by how far they are from the stop line; who is before the lanes part is shared out."""
-        shape = len(ZONES_M)
-        own = np.bincount(self._zone_place, list(map(self._present, self._zones)), self._groups * shape)
-        own = np.asarray(own, dtype=float).reshape(self._groups, shape)
+        own = self._by_zone(self._zones, self._zone_place, self._groups)
         if not self._before_zones:
             return own
-        veh = list(map(self._present, self._before_zones))
-        before = np.bincount(self._before_zone_place, veh, self._links * shape).reshape(self._links, shape)
+        before = self._by_zone(self._before_zones, self._before_zone_place, self._links)
         return np.asarray(own + before[self._group_link] * self._share[:, None])
 
     def crossed_veh(self, time_s: float) -> tuple[Floats, Floats]:
@@ -113,6 +110,11 @@ class Eyes:
 
     def _by_link(self, getter: Any, names: Sequence[str], link: Ints) -> Floats:
         return np.asarray(np.bincount(link, list(map(getter, names)), self._links), dtype=float)
+
+    def _by_zone(self, names: Sequence[str], place: Ints, rows: int) -> Floats:
+        """(rows, zones) vehicles that the detectors of zones count."""
+        veh = np.bincount(place, list(map(self._present, names)), rows * len(ZONES_M))
+        return np.asarray(veh, dtype=float).reshape(rows, len(ZONES_M))
 
     def _by_group(self, counts: Sequence[int]) -> Floats:
         """(G,) what all areas count, by lane group; who is before the lanes part is shared out as the traffic is."""
