@@ -7,15 +7,16 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 from tests.integration import odd_nets
 
-from utn_sumo import bridge, monitor
+from utn_sumo import bridge, monitor, streets
 from utn_sumo.contract import Network
 from utn_sumo.controllers import EXECUTION, registered
-from utn_sumo.detectors import ids
+from utn_sumo.detectors import CAR_M, ids, write
 from utn_sumo.errors import ControllerError, SettingError, UtnError
 from utn_sumo.plant.eyes import Eyes, Sight
 from utn_sumo.plant.heads import Heads
@@ -165,3 +166,65 @@ def test_what_nobody_asks_for_is_not_read_and_nothing_is_read_twice(utn17: Netwo
     sight.gap_one_s(0)
     assert sumo.asked["getTimeSinceDetection"] == len(utn17.groups[0].lanes)
     assert "getLastStepHaltingNumber" not in sumo.asked
+
+
+SEES = """
+import libsumo
+import numpy as np
+from utn_sumo.contract import ZONES_M
+
+class Sees:
+    every_s = 3
+    def __init__(self, network, path):
+        self.network, self.path = network, path
+    def begin(self, plan, state):
+        pass
+    def wish(self, view):
+        off, all_veh = 0.0, 0
+        for group, lanes in enumerate(self.network.groups):
+            edge = self.network.links[lanes.link].edges[-1]
+            away_m = [
+                self.network.edge_length_m[edge] - libsumo.vehicle.getLanePosition(vehicle)
+                for lane in lanes.lanes for vehicle in libsumo.lane.getLastStepVehicleIDs(f"{edge}_{lane}")
+            ]
+            true = np.histogram(away_m, [0.0, *ZONES_M])[0]
+            off, all_veh = off + abs(true - view.zone_veh[group]).sum(), all_veh + true.sum()
+        with open(self.path, "a", encoding="utf-8") as file:
+            print(off, all_veh, file=file)
+        return np.array([j.stages[int(view.time_s // 30) % len(j.stages)] for j in self.network.junctions])
+"""
+
+
+def test_zones_show_where_vehicles_are(tmp_path: Path) -> None:
+    own, seen = tmp_path / "sees.py", tmp_path / "seen.txt"
+    own.write_text(SEES, encoding="utf-8")
+    settings = {"execution": {"path": str(seen)}}
+    chosen = scenario(controller="fixed", execution=f"{own}:Sees", hours=0.3, settings=settings)
+    assert bridge.run(chosen, tmp_path / "run")["fallbacks"] == 0
+    off_veh, all_veh = np.loadtxt(seen).sum(axis=0)
+    assert all_veh > 10_000
+    # A vehicle that changes lanes is on two for a while.
+    assert off_veh < 0.02 * all_veh
+
+
+@pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
+def test_zones_cover_what_the_detectors_see_and_nothing_twice(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    net = streets.named(str(make(tmp_path)))
+    write(net, tmp_path / "detectors.add.xml", 90, zones=True)
+    areas: dict[str, list[tuple[float, float]]] = {}
+    zones: dict[str, list[tuple[float, float]]] = {}
+    for element in ET.parse(tmp_path / "detectors.add.xml").getroot().iter("laneAreaDetector"):
+        kind = zones if "_zone" in element.attrib["id"] else areas
+        kind.setdefault(element.attrib["lane"], []).append(
+            (float(element.attrib["pos"]), float(element.attrib["endPos"]))
+        )
+    named = ids(net)
+    assert sum(map(len, zones.values())) == sum(
+        len(names) for rows in (named.group_zone, named.upstream_zone) for zone in rows for names in zone
+    )
+    assert zones.keys() == areas.keys()
+    for lane, ((begin_m, end_m),) in areas.items():
+        pieces = sorted(zones[lane])
+        assert pieces[0][0] == pytest.approx(begin_m, abs=0.01)
+        assert end_m - CAR_M - 0.01 <= pieces[-1][1] <= end_m
+        assert all(before[1] <= after[0] for before, after in pairwise(pieces))
