@@ -477,6 +477,28 @@ class TestExecution:
             execution.wish(replace(scene(utn17), near_veh=near_veh, x_veh=x_veh))
             assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
 
+    @pytest.mark.parametrize(
+        ("goes", "stands", "stays"), [(False, True, False), (True, True, True), (False, False, True)]
+    )
+    def test_a_queue_that_has_green_and_does_not_go_makes_way_for_others(
+        self, goes: bool, stands: bool, stays: bool, utn17: Network
+    ) -> None:
+        served = utn17.serves[[junction.stages[0] for junction in utn17.junctions]].any(axis=0)
+        near_veh = np.full(len(utn17.groups), 1.0 * stands)
+        near_veh[utn17.turn_group[served]] = 12.0 * stands
+        execution, begin_s = Scheduled(utn17), np.full(len(utn17.junctions), 30.0)
+
+        def stay(now_s: float, begin_s: Floats) -> bool:
+            left_veh = np.full(len(utn17.links), now_s * goes)
+            view = replace(scene(utn17, now_s), near_veh=near_veh, left_veh=left_veh, begin_s=begin_s)
+            return bool((execution.wish(view) == view.stage).all())
+
+        # It takes a while until who has come into sight stands.
+        assert all(stay(now_s, begin_s) for now_s in np.arange(0.0, 38.0, 2.0))
+        assert stay(38.0, begin_s) == stays
+        # A new green has as long again.
+        assert stay(40.0, begin_s + 10.0)
+
     @pytest.mark.parametrize("made", [Scheduled, Recommended])
     @pytest.mark.parametrize(
         "settings", [{"horizn_s": 50}, {"horizon_s": 5}, {"order": "random"}, {"bounds": 1}, {"full": 0}]

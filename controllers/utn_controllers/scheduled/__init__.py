@@ -6,6 +6,7 @@ and others 2012).
 
 streams.py      what queues before a junction and moves together
 outlook.py      who stands and who comes, by stream
+standstill.py   who has green and does not go
 programme.py    the dynamic programme of one junction
 execution.py    what goes with a plan: `scheduled`
 """

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
+from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network, Plan, State, View
 
@@ -23,11 +24,14 @@ SOON_FADING = np.array([1.0, 0.9, 0.81, 0.73])
 LEAST_WORTH = 0.05
 """Of a vehicle that would go from an empty link into a full one."""
 BLOCKED_VEH = 1e-6
-"""What leaves in a bin towards a link that is fed no more."""
+"""What leaves in a bin where nobody goes, or is to go."""
 
 
 class ScheduledSettings(BaseModel):
-    """Settings of `scheduled`, found on `utn17` (0.3 to 1.3), cologne8 and ingolstadt7 with seeds 1 to 3."""
+    """Settings of `scheduled`, found on `utn17` (0.3 to 1.3), cologne8 and ingolstadt7 with seeds 1 to 3.
+
+    But for `standstill_s`: on the nets of tools/tuning_nets.py.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -47,6 +51,8 @@ class ScheduledSettings(BaseModel):
     """By how much waiting on a full link costs more than on an empty one, in vehicles."""
     full: float = Field(0.5, gt=0, le=2)
     """Share of its storage from which a link is fed no more: beyond it some lane is full and stops the junction."""
+    standstill_s: float = Field(8.0, ge=2, le=200)
+    """How long a queue may have green and nobody go before others are served [s]."""
 
 
 class Scheduled:
@@ -61,6 +67,7 @@ class Scheduled:
         self._streams = Streams(network)
         bins = round(self.settings.horizon_s / BIN_S)
         self._outlook = Outlook(network, self._streams, bins, BIN_S, self.settings.early_s)
+        self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
         self._clearance = np.maximum(_bins(network.clearance_s[stages] - BACK_S), 1)
         self._least = np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64)
@@ -93,6 +100,7 @@ class Scheduled:
             settings.crowding,
             settings.full,
         )
+        most[self._standstill.look(view, stand)] = BLOCKED_VEH
         if self._green_s is None:
             rest = self._endless
         else:
