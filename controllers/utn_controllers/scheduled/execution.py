@@ -9,16 +9,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.compiling import compiled
+from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network, Plan, State, View
 
-BIN_S = 2.0
+BIN_S = 2
 """Length of a bin, and time between two decisions."""
-BACK_S = 1.0
-"""What of a clearance is not lost: the yellow is driven on for longer than the next queue takes to start."""
 SOON_FADING = np.array([1.0, 0.9, 0.81, 0.73])
 """What a vehicle loses by red in each bin before its arrival, over the last one's."""
 LEAST_WORTH = 0.05
@@ -69,11 +68,19 @@ class Scheduled:
         self._outlook = Outlook(network, self._streams, bins, BIN_S, self.settings.early_s)
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
-        self._clearance = np.maximum(_bins(network.clearance_s[stages] - BACK_S), 1)
-        self._least = np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64)
-        self._follows = self._orders()
+        moves = Moves(network, self._streams, BIN_S)
+        self._rules = Rules(
+            stages,
+            self._streams.first_stage,
+            self._streams.first,
+            self._orders(),
+            moves.share,
+            moves.row,
+            moves.bins,
+            np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
+        )
         self._soon = self.settings.slowing_s / BIN_S * SOON_FADING
-        self._plan = np.zeros((len(network.junctions), bins), dtype=np.int64)
+        self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules."""
         self._endless = np.full(len(network.junctions), bins)
         self._green_s: Floats | None = None
@@ -111,13 +118,7 @@ class Scheduled:
                 view.stage,
                 view.free,
                 rest,
-                streams.stage,
-                streams.first_stage,
-                streams.first,
-                self._follows,
-                streams.serves,
-                self._clearance,
-                self._least,
+                self._rules,
                 stand,
                 come,
                 self._soon,
@@ -176,8 +177,3 @@ class _Nobody:
     x_veh: Floats
     entered_veh: Floats
     left_veh: Floats
-
-
-def _bins(seconds: Floats) -> Ints:
-    """So many bins, the nearest number."""
-    return np.floor(seconds / BIN_S + 0.5).astype(np.int64)
