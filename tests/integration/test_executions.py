@@ -41,6 +41,14 @@ class Strays(Keeps):
     def wish(self, view):
         return view.stage[::-1]
 
+class Counts(Keeps):
+    due_s = 0
+    def wish(self, view):
+        if view.time_s != self.due_s:
+            raise RuntimeError(f"asked at {view.time_s}, not at {self.due_s}")
+        self.due_s += self.every_s
+        return view.stage
+
 class Hasty(Keeps):
     def __init__(self, network):
         self.every_s = 0
@@ -111,6 +119,12 @@ def test_an_execution_that_fails_is_written_down_and_everybody_still_gets_green(
     assert why in result["fallback_reasons"][0]
     assert result["unsafe_signal_s"] == 0
     assert result["arrived"] > 50
+
+
+def test_an_execution_is_asked_every_time_whether_a_junction_is_free_or_none(own: str, tmp_path: Path) -> None:
+    """It may keep in mind what has come since: all junctions begin with a least green in which none is free."""
+    chosen = scenario(controller="fixed", execution=f"{own}:Counts", hours=0.05)
+    assert bridge.run(chosen, tmp_path / "run")["fallback_reasons"] == []
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
 from utn_controllers.scheduled.execution import Scheduled
+from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, Floats, Ints, Network
@@ -23,6 +25,8 @@ from utn_sumo.estimation import Estimator
 from utn_sumo.plant.heads import Heads
 
 Make = Callable[[Path], Path]
+
+Shares = Sequence[Sequence[float]]
 
 BLOCKED_VEH = 1e-6
 NEAR_ENOUGH = 1.1
@@ -37,6 +41,28 @@ class Crossing:
     least: tuple[int, ...] = (2, 2)
     bins: int = 25
     cyclic: bool = False
+    held: dict[tuple[int, int], Shares] = field(default_factory=dict)
+    """Share of each bin that each stream has green in the clearance from a stage to another: else all is red."""
+
+    def cleared(self, stage: int, other: int) -> Floats:
+        """(bins, N) what moves in the clearance from a stage to another."""
+        red = np.zeros((self.clearance[stage], len(self.clearance)))
+        return np.array(self.held.get((stage, other), red), dtype=float)
+
+    def rules(self) -> Rules:
+        stages = len(self.clearance)
+        place = np.arange(stages)
+        follows = place == ((place + 1) % stages)[:, None] if self.cyclic else np.ones((stages, stages), dtype=bool)
+        moves, clearing = np.eye(stages), np.full((stages, stages), -1)
+        clearance = np.ones((stages, stages), dtype=np.int64)
+        for stage, other in np.ndindex(stages, stages):
+            shares = self.cleared(stage, other)
+            clearance[stage, other] = len(shares)
+            if shares.any():
+                clearing[stage, other] = len(moves)
+                moves = np.vstack([moves, shares])
+        first = np.array([0, stages])
+        return Rules(place, first, first, follows, moves, clearing, clearance, np.array(self.least))
 
     def decide(
         self,
@@ -52,23 +78,15 @@ class Crossing:
         plan: Ints | None = None,
         sent: Floats | None = None,
     ) -> tuple[int, Floats]:
-        """The stage led to, and (N, K) what is sent off; `plan` is the schedule of the bin before."""
+        """The stage led to, and (N, K) what is sent off; `plan` (K,) is the schedule of the bin before."""
         stages = len(self.clearance)
-        place = np.arange(stages)
-        follows = place == ((place + 1) % stages)[:, None] if self.cyclic else np.ones((stages, stages), dtype=bool)
         plan = np.zeros(self.bins, dtype=np.int64) if plan is None else plan
         sent = np.zeros((stages, self.bins)) if sent is None else sent.copy()
         wish = schedules(
             np.array([stage]),
             np.array([free]),
             np.array([self.bins if rest is None else rest]),
-            place,
-            np.array([0, stages]),
-            np.array([0, stages]),
-            follows,
-            np.eye(stages, dtype=bool),
-            np.array(self.clearance),
-            np.array(self.least),
+            self.rules(),
             np.zeros(stages) + np.array(stand, dtype=float),
             np.zeros((stages, self.bins)) if come is None else come,
             np.zeros(4) if soon is None else soon,
@@ -125,13 +143,13 @@ def waited(shown: list[int], stand: list[float], come: list[list[float]], worth:
 Drawn = tuple[Crossing, list[float], list[list[float]], list[float], float]
 
 
-def a_bin(stage: int, place: int, queue: Floats, drawn: Drawn, soon: Floats) -> tuple[float, Floats]:
-    """What is waited in a bin, with those who brake before red, and the queues behind it."""
+def a_bin(green: Floats, place: int, queue: Floats, drawn: Drawn, soon: Floats) -> tuple[float, Floats]:
+    """What is waited in a bin of which streams have the share `green`, with those who brake before red; the queues."""
     _, _, come, worth, most = drawn
     queue, cost = queue + np.array(come)[:, place], 0.0
-    for stream in range(2):
-        if stream == stage:
-            queue[stream] = max(queue[stream] - most, 0.0)
+    for stream, share in enumerate(green):
+        if share > 0:
+            queue[stream] = max(queue[stream] - share * most, 0.0)
         else:
             ahead = come[stream][place + 1 : place + 1 + len(soon)]
             cost += worth[stream] * float(soon[: len(ahead)] @ ahead)
@@ -141,40 +159,59 @@ def a_bin(stage: int, place: int, queue: Floats, drawn: Drawn, soon: Floats) -> 
 def plainly(drawn: Drawn, soon: Floats, rest: int) -> tuple[set[int], float]:
     """The same programme, each bin gone through anew for each way: what may be led to first, and the least cost."""
     crossing, stand = drawn[0], np.array(drawn[1])
-    bins, ends = crossing.bins, list[tuple[float, int]]()
+    bins, stages, ends = crossing.bins, len(stand), list[tuple[float, int]]()
+    called = [stage for stage in range(stages) if stage == 0 or stand[stage] + sum(drawn[2][stage]) > 0]
     # (begin, stage): cost, queues, the stage led to in the first bin.
     states = {(0, 0): (0.0, stand, 0)}
-    for begin, stage in np.ndindex(bins, 2):
+    for begin, stage in np.ndindex(bins, stages):
         spent, queue, first = states.get((begin, stage), (np.inf, stand, 0))
         last = bins if begin else min(rest, bins)
         for now in range(begin, last + 1):
             if now == bins:
                 ends.append((spent, first))
             elif now >= (begin + crossing.least[stage] if begin else 0):
-                until, cleared, opens = spent, queue, min(now + crossing.clearance[stage], bins)
-                for place in range(now, opens):
-                    cost, cleared = a_bin(-1, place, cleared, drawn, soon)
-                    until += cost
-                if until < states.get((opens, 1 - stage), (np.inf,))[0] - 1e-9:
-                    states[opens, 1 - stage] = until, cleared, 1 - stage if now == 0 else first
+                for other in called:
+                    if other == stage:
+                        continue
+                    until, cleared, opens = spent, queue, now
+                    for green in crossing.cleared(stage, other)[: bins - now]:
+                        cost, cleared = a_bin(green, opens, cleared, drawn, soon)
+                        until, opens = until + cost, opens + 1
+                    if until < states.get((opens, other), (np.inf,))[0] - 1e-9:
+                        states[opens, other] = until, cleared, other if now == 0 else first
             if now < last:
-                cost, queue = a_bin(stage, now, queue, drawn, soon)
+                cost, queue = a_bin(np.eye(stages)[stage], now, queue, drawn, soon)
                 spent += cost
     ends += [(cost, first) for (begin, _), (cost, _, first) in states.items() if begin == bins]
     least = min(ends, key=lambda end: end[0])[0]
     return {first for cost, first in ends if cost <= least + 1e-9}, least
 
 
+def lists(items: st.SearchStrategy[Any], count: int) -> st.SearchStrategy[list[Any]]:
+    return st.lists(items, min_size=count, max_size=count)
+
+
 @st.composite
-def junctions(draw: st.DrawFn) -> Drawn:
-    """Two stages, who stands and comes, how much each is worth, and what leaves in a bin."""
-    few = st.integers(1, 2)
-    crossing = Crossing((draw(few), draw(few)), (draw(few), draw(few)), draw(st.integers(8, 10)))
+def junctions(draw: st.DrawFn, stages: int = 2) -> Drawn:
+    """So many stages, who stands and comes, how much each is worth, and what leaves in a bin."""
+    few = lists(st.integers(1, 2), stages).map(tuple)
+    crossing = Crossing(draw(few), draw(few), draw(st.integers(8, 10)))
     veh = st.integers(0, 24).map(lambda quarters: quarters / 4)
     share = st.sampled_from([0.0, 0.0, 0.0, 0.25, 0.5, 1.0, 2.0])
-    come = draw(st.lists(st.lists(share, min_size=crossing.bins, max_size=crossing.bins), min_size=2, max_size=2))
-    worth = draw(st.lists(st.sampled_from([0.5, 1.0, 1.5]), min_size=2, max_size=2))
-    return crossing, draw(st.lists(veh, min_size=2, max_size=2)), come, worth, draw(st.sampled_from([1.0, 1.5]))
+    come = draw(lists(lists(share, crossing.bins), stages))
+    worth = draw(lists(st.sampled_from([0.5, 1.0, 1.5]), stages))
+    return crossing, draw(lists(veh, stages)), come, worth, draw(st.sampled_from([1.0, 1.5]))
+
+
+@st.composite
+def holding(draw: st.DrawFn) -> Drawn:
+    """Two stages or three, with clearances of any length in some of which some streams have green for a while."""
+    drawn = draw(st.integers(2, 3).flatmap(junctions))
+    stages = len(drawn[1])
+    shares = lists(st.sampled_from([0.0, 0.0, 0.5, 1.0]), stages)
+    pairs = st.tuples(st.integers(0, stages - 1), st.integers(0, stages - 1))
+    held = draw(st.dictionaries(pairs, st.lists(shares, min_size=1, max_size=4), max_size=6))
+    return replace(drawn[0], held=held), *drawn[1:]
 
 
 class TestProgramme:
@@ -205,7 +242,7 @@ class TestProgramme:
         # Never two that cross in one bin.
         assert (np.minimum(sent[0], sent[1]) <= 1e-9).all()
 
-    @given(drawn=junctions(), stage=st.integers(0, 1), rest=st.integers(0, 10), data=st.data())
+    @given(drawn=holding(), stage=st.integers(0, 1), rest=st.integers(0, 10), data=st.data())
     def test_whatever_the_last_schedule_was_the_next_is_the_same(
         self,
         drawn: Drawn,
@@ -215,7 +252,7 @@ class TestProgramme:
     ) -> None:
         """It bounds the search: one that is better than any the search finds must not leave it empty-handed."""
         crossing, stand, come, worth, most = drawn
-        shown = st.lists(st.integers(-1, 1), min_size=crossing.bins, max_size=crossing.bins)
+        shown = lists(st.integers(-1, len(crossing.rules().moves) - 1), crossing.bins)
         last = data.draw(st.one_of(shown, st.sampled_from(list(every_sequence(crossing)))))
         given_now = {"stage": stage, "rest": rest, "worth": worth, "most": most}
         wish, sent = crossing.decide(stand, np.array(come), **given_now)
@@ -223,12 +260,12 @@ class TestProgramme:
         assert other_wish == wish
         assert (other_sent == sent).all()
 
-    @given(drawn=junctions(), rest=st.integers(0, 10), soon=st.sampled_from([0.0, 0.3, 2.0]))
+    @given(drawn=holding(), rest=st.integers(0, 10), soon=st.sampled_from([0.0, 0.3, 2.0]))
     def test_it_finds_what_the_programme_finds_without_sums_and_bounds(
         self, drawn: Drawn, rest: int, soon: float
     ) -> None:
         crossing, stand, come, worth, most = drawn
-        assume(stand[1] + sum(come[1]) > 0)
+        assume(sum(stand[1:]) + np.sum(come[1:]) > 0)
         slowing = np.array([soon, soon / 2])
         wish, sent = crossing.decide(stand, np.array(come), rest=rest, worth=worth, most=most, soon=slowing)
         found, cost = plainly(drawn, slowing, rest)
@@ -274,6 +311,16 @@ class TestProgramme:
         wish, sent = Crossing().decide([0.0, 1.0])
         assert wish == 1
         assert np.flatnonzero(sent[1]).tolist() == [2]
+
+    def test_green_that_is_held_through_the_clearance_serves(self) -> None:
+        crossing = Crossing((3, 3), held={(0, 1): ((1.0, 0.0), (0.5, 0.0), (0.0, 0.0))})
+        wish, sent = crossing.decide([1.5, 4.0])
+        assert wish == 1
+        assert sent[0, :3] == pytest.approx([1.0, 0.5, 0.0])
+        assert sent[1, :5] == pytest.approx([0.0, 0.0, 0.0, 1.0, 1.0])
+        # Without it they would be served before.
+        assert replace(crossing, held={}).decide([1.5, 1.0])[0] == 0
+        assert crossing.decide([1.5, 1.0])[0] == 1
 
     def test_a_stage_whose_traffic_goes_onto_a_full_link_is_passed_over(self) -> None:
         three = Crossing((2, 2, 2), (2, 2, 2))
@@ -379,6 +426,44 @@ class TestStreams:
         self.agree(network, network.fraction)
 
 
+class TestMoves:
+    def test_they_are_the_stages_greens_first(self, net: Network) -> None:
+        streams = Streams(net)
+        moves = Moves(net, streams, 2)
+        for row, junction in enumerate(net.stage_junction[streams.stage]):
+            a, b = streams.first[junction], streams.first[junction + 1]
+            assert (moves.share[row, : b - a] == streams.serves[row, a:b]).all()
+            assert not moves.share[row, b - a :].any()
+
+    def test_nobody_moves_where_all_lose_green(self, utn17: Network) -> None:
+        moves = Moves(utn17, Streams(utn17), 2)
+        assert (moves.row == -1).all()
+        assert len(moves.share) == len(utn17.stages)
+        # Three seconds of yellow and two of red, rounded up.
+        counts = [len(junction.stages) for junction in utn17.junctions]
+        assert (moves.bins == 3).sum() == sum(count * (count - 1) for count in counts)
+
+    def test_vehicles_go_on_while_who_walks_is_cleared(self, street_of: Callable[[Make], Network]) -> None:
+        network = street_of(odd_nets.pedestrians)
+        streams = Streams(network)
+        moves = Moves(network, streams, 2)
+        held = [index for index, stage in enumerate(network.stages) if any(stage.held)]
+        assert held
+        for stage in held:
+            row = int(np.flatnonzero(streams.stage == stage)[0])
+            stages = network.junctions[network.stages[stage].junction].stages
+            then = (stages.index(stage) + 1) % len(stages)
+            a = streams.first[network.stages[stage].junction]
+            open_s = sum(
+                seconds
+                for (_, seconds), turns in zip(network.stages[stage].clearance, network.stages[stage].held, strict=True)
+                if turns
+            )
+            rows = moves.share[moves.row[row, then] : moves.row[row, then] + moves.bins[row, then]]
+            served = np.flatnonzero(streams.serves[row, a : streams.first[network.stages[stage].junction + 1]])
+            assert 2 * rows[:, served].sum(axis=0).max() == pytest.approx(open_s)
+
+
 class TestLeastGreen:
     def test_it_is_sumo_s_own_where_the_net_names_none(self, net: Network) -> None:
         assert (net.least_green_s == 5).all()
@@ -476,6 +561,28 @@ class TestExecution:
             near_veh[streams.group[stream]] = 8.0
             execution.wish(replace(scene(utn17), zone_veh=by_the_line(near_veh), x_veh=x_veh))
             assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
+
+    @pytest.mark.parametrize(
+        ("goes", "stands", "stays"), [(False, True, False), (True, True, True), (False, False, True)]
+    )
+    def test_a_queue_that_has_green_and_does_not_go_makes_way_for_others(
+        self, goes: bool, stands: bool, stays: bool, utn17: Network
+    ) -> None:
+        served = utn17.serves[[junction.stages[0] for junction in utn17.junctions]].any(axis=0)
+        near_veh = np.full(len(utn17.groups), 1.0 * stands)
+        near_veh[utn17.turn_group[served]] = 12.0 * stands
+        execution, begin_s = Scheduled(utn17), np.full(len(utn17.junctions), 30.0)
+
+        def stay(now_s: float, begin_s: Floats) -> bool:
+            left_veh = np.full(len(utn17.links), now_s * goes)
+            view = replace(scene(utn17, now_s), near_veh=near_veh, left_veh=left_veh, begin_s=begin_s)
+            return bool((execution.wish(view) == view.stage).all())
+
+        # It takes a while until who has come into sight stands.
+        assert all(stay(now_s, begin_s) for now_s in np.arange(0.0, 38.0, 2.0))
+        assert stay(38.0, begin_s) == stays
+        # A new green has as long again.
+        assert stay(40.0, begin_s + 10.0)
 
     @pytest.mark.parametrize("made", [Scheduled, Recommended])
     @pytest.mark.parametrize(

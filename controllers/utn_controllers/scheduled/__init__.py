@@ -5,7 +5,10 @@ neighbours' schedules will send; in the tradition of OPAC (Gartner 1983), COP (S
 and others 2012).
 
 streams.py      what queues before a junction and moves together
+moves.py        what moves in a stage, and in the clearance between two
 outlook.py      who stands and who comes, by stream
+standstill.py   who has green and does not go
+traffic.py      what the programme has of those who stand and come
 programme.py    the dynamic programme of one junction
 execution.py    what goes with a plan: `scheduled`
 """

@@ -9,23 +9,30 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.compiling import compiled
+from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
+from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
 
-BIN_S = 2.0
+BIN_S = 2
 """Length of a bin, and time between two decisions."""
 SOON_FADING = np.array([1.0, 0.9, 0.81, 0.73])
 """What a vehicle loses by red in each bin before its arrival, over the last one's."""
+FADING = 0.2
+"""Over what share of its storage about `full` a link is fed less and less."""
 LEAST_WORTH = 0.05
 """Of a vehicle that would go from an empty link into a full one."""
 BLOCKED_VEH = 1e-6
-"""What leaves in a bin towards a link that is fed no more."""
+"""What leaves in a bin where nobody goes, or is to go."""
 
 
 class ScheduledSettings(BaseModel):
-    """Settings of `scheduled`, found on `utn17` (0.3 to 1.3), cologne8 and ingolstadt7 with seeds 1 to 3."""
+    """Settings of `scheduled`, found on `utn17` (0.3 to 1.3), cologne8 and ingolstadt7 with seeds 1 to 3.
+
+    But for `standstill_s`: on the nets of tools/tuning_nets.py.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -42,7 +49,9 @@ class ScheduledSettings(BaseModel):
     crowding: float = Field(0.4, ge=0, le=20)
     """By how much waiting on a full link costs more than on an empty one, in vehicles."""
     full: float = Field(0.5, gt=0, le=2)
-    """Share of its storage from which a link is fed no more: beyond it some lane is full and stops the junction."""
+    """Share of its storage about which a link is fed less and less: beyond it some lane is full and stops all."""
+    standstill_s: float = Field(8.0, ge=2, le=200)
+    """How long a queue may have green and nobody go before others are served [s]."""
 
 
 class Scheduled:
@@ -57,12 +66,21 @@ class Scheduled:
         self._streams = Streams(network)
         bins = round(self.settings.horizon_s / BIN_S)
         self._outlook = Outlook(network, self._streams, bins, BIN_S)
+        self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
-        self._clearance = np.maximum(_bins(network.clearance_s[stages]), 1)
-        self._least = np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64)
-        self._follows = self._orders()
+        moves = Moves(network, self._streams, BIN_S)
+        self._rules = Rules(
+            stages,
+            self._streams.first_stage,
+            self._streams.first,
+            self._orders(),
+            moves.share,
+            moves.row,
+            moves.bins,
+            np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
+        )
         self._soon = self.settings.slowing_s / BIN_S * SOON_FADING
-        self._plan = np.zeros((len(network.junctions), bins), dtype=np.int64)
+        self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules."""
         self._endless = np.full(len(network.junctions), bins)
         self._green_s: Floats | None = None
@@ -89,6 +107,7 @@ class Scheduled:
             settings.crowding,
             settings.full,
         )
+        most[self._standstill.look(view, stand)] = BLOCKED_VEH
         if self._green_s is None:
             rest = self._endless
         else:
@@ -99,13 +118,7 @@ class Scheduled:
                 view.stage,
                 view.free,
                 rest,
-                streams.stage,
-                streams.first_stage,
-                streams.first,
-                self._follows,
-                streams.serves,
-                self._clearance,
-                self._least,
+                self._rules,
                 stand,
                 come,
                 self._soon,
@@ -122,7 +135,7 @@ class Scheduled:
         stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
         zones = np.zeros((len(self.network.groups), len(ZONES_M)))
-        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none))
+        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, none))
 
     def _take_up(self) -> None:
         flow_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]
@@ -148,8 +161,9 @@ def _priced(
         taken = x[ahead] / storage[ahead] if ahead != EXIT else 0.0
         own = x[links[stream]] / storage[links[stream]]
         worth[stream] = max(1 + crowding * (own - taken), LEAST_WORTH)
-        if taken > full:
-            moving[stream] = BLOCKED_VEH
+        fed = (full + FADING / 2 - taken) / FADING
+        if fed < 1:
+            moving[stream] = max(fed * most[stream], BLOCKED_VEH)
     return worth, moving
 
 
@@ -164,8 +178,4 @@ class _Nobody:
     zone_veh: Floats
     x_veh: Floats
     entered_veh: Floats
-
-
-def _bins(seconds: Floats) -> Ints:
-    """So many bins, the nearest number."""
-    return np.floor(seconds / BIN_S + 0.5).astype(np.int64)
+    left_veh: Floats

@@ -3,8 +3,8 @@
 Forward over the bins, as COP (Sen and Head 1997). A state is a stage that begins in a bin; of two ways that lead to
 it, the one on which less has been waited goes on, with the queues that it leaves. From there the stage may last until
 any later bin. Of those who have red nobody leaves, so that what they wait is a difference of sums made once; bin by
-bin go only those who have green. A way is left on which more has been waited than on another to its end, at first than
-by the schedule of the bin before.
+bin go only those who have green, in a stage or for a while in a clearance. A way is left on which more has been waited
+than on another to its end, at first than by the schedule of the bin before.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from utn_controllers.compiling import compiled
+from utn_controllers.scheduled.moves import Rules
+from utn_controllers.scheduled.traffic import Traffic
 from utn_sumo.contract import Bools, Floats, Ints
 
 NEVER = 1e18
@@ -24,124 +26,92 @@ ALIKE = 1e-9
 
 @compiled
 def schedules(
-    stage: Ints,
-    free: Bools,
-    rest: Ints,
-    stages: Ints,
-    first_stage: Ints,
-    first: Ints,
-    follows: Bools,
-    serves: Bools,
-    clearance: Ints,
-    least: Ints,
-    stand: Floats,
-    come: Floats,
-    soon: Floats,
-    worth: Floats,
-    most: Floats,
-    plan: Ints,
-    sent: Floats,
-) -> Ints:
+    stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, soon: Floats, worth: Floats,
+    most: Floats, plan: Ints, sent: Floats,
+) -> Ints:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
-    `rest` (J,) bins that the present one may still go on; `stages` (S,) the network's stage of each row, junctions'
-    rows from `first_stage` on, their streams from `first`; `follows` (S, most stages of a junction) whether its
-    junction's nth stage may come after a row's. `clearance` and `least` (S,) in bins. `stand` (N,), `come` (N, K)
-    vehicles; `soon` (n,) what it costs to show an arriving vehicle red in each bin before its arrival; `worth` (N,)
-    weight of a vehicle, `most` (N,) that leave in a bin of green.
+    `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `soon` (n,) what it
+    costs to show an arriving vehicle red in each bin before its arrival; `worth` (N,) weight of a vehicle, `most` (N,)
+    that leave in a bin of green.
 
     `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
-    those of now. Of a schedule is said which of its junction's stages is shown in each bin, -1 for a clearance; of
-    junctions that are not free, what is left of the last one.
+    those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
+    not free, what is left of the last one.
     """
     wish = stage.copy()
     for junction in range(len(stage)):
-        a, b = first[junction], first[junction + 1]
-        low, high = first_stage[junction], first_stage[junction + 1]
+        a, b = rules.first[junction], rules.first[junction + 1]
         plan[junction, :-1] = plan[junction, 1:]
         if not free[junction] or b == a:
             sent[a:b, :-1] = sent[a:b, 1:]
             continue
-        row = low
-        while stages[row] != stage[junction]:
-            row += 1
+        low, present = rules.first_stage[junction], 0
+        while rules.stages[low + present] != stage[junction]:
+            present += 1
+        stages = rules.first_stage[junction + 1] - low
         chosen = _schedule(
-            row - low,
-            rest[junction],
-            follows[low:high],
-            serves[low:high, a:b],
-            clearance[low:high],
-            least[low:high],
-            stand[a:b],
-            come[a:b],
-            soon,
-            worth[a:b],
-            most[a:b],
-            plan[junction],
-            sent[a:b],
-        )
-        wish[junction] = stages[low + chosen]
+            present, rest[junction], low, stages, rules, stand[a:b], come[a:b], soon, worth[a:b], most[a:b],
+            plan[junction], sent[a:b],
+        )  # fmt: skip
+        wish[junction] = rules.stages[low + chosen]
     return wish
 
 
 @compiled
 def _schedule(
-    present: int, rest: int, follows: Bools, serves: Bools, clearance: Ints, least: Ints, stand: Floats, come: Floats,
-    soon: Floats, worth: Floats, most: Floats, plan: Ints, sent: Floats,
+    present: int, rest: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats, soon: Floats,
+    worth: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> int:  # fmt: skip
-    """The stage that one junction leads to in this bin, the `present` one if it stays; all counted within it."""
+    """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on."""
     chosen = present
-    called = _called(present, follows, serves, stand, come)
+    called = _called(present, low, stages, rules, stand, come)
     if called.any():
-        came, grown, paid, slowed = _sums(serves, come, soon, worth)
+        traffic = _sums(rules.moves[low : low + stages], stand, come, soon, worth, most)
         # What was best a bin ago is seldom far from what is best now.
-        known = _waited(plan, serves, stand, come, slowed, worth, most)
+        known = _waited(plan, rules.moves, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
-            chosen = _search(
-                present, rest, called, follows, serves, clearance, least, stand, come, came, grown, paid, worth, most,
-                limit, plan,
-            )  # fmt: skip
+            chosen = _search(present, rest, low, called, rules, traffic, limit, plan)
             if chosen >= 0:
                 break
     else:
-        plan[:] = present
-    _send_off(plan, serves, stand, come, most, sent)
+        plan[:] = low + present
+    _send_off(plan, rules.moves, stand, come, most, sent)
     return chosen
 
 
 @compiled
-def _called(present: int, follows: Bools, serves: Bools, stand: Floats, come: Floats) -> Bools:
-    """(stages,) stages that somebody needs who has no green in the present one; if there are any, that one too.
+def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats) -> Bools:
+    """(s,) stages that somebody needs who has no green in the present one; if there are any, that one too.
 
     In a fixed order the way to them leads through all.
     """
-    called = np.zeros(len(serves), np.bool_)
+    called = np.zeros(stages, np.bool_)
     for stream in range(len(stand)):
-        if not serves[present, stream] and stand[stream] + come[stream].sum() >= SOME_VEH:
-            for stage in range(len(serves)):
-                called[stage] |= serves[stage, stream]
+        if rules.moves[low + present, stream] == 0 and stand[stream] + come[stream].sum() >= SOME_VEH:
+            for stage in range(stages):
+                called[stage] |= rules.moves[low + stage, stream] > 0
     if called.any():
         called[present] = True
-        called |= not follows.all()
+        called |= not rules.follows[low : low + stages, :stages].all()
     return called
 
 
 @compiled
-def _search(  # noqa: C901, PLR0912 - one search, all in one place for the compiler
-    present: int, rest: int, called: Bools, follows: Bools, serves: Bools, clearance: Ints, least: Ints, stand: Floats,
-    come: Floats, came: Floats, grown: Floats, paid: Floats, worth: Floats, most: Floats, limit: float, plan: Ints,
-) -> int:  # fmt: skip
-    """The stage that is led to in the first bin, and into `plan` (K,) that of each; -1 if all costs `limit` or more."""
-    (stages, streams), bins, red = serves.shape, len(plan), len(serves)
+def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for the compiler
+    present: int, rest: int, low: int, called: Bools, rules: Rules, traffic: Traffic, limit: float, plan: Ints
+) -> int:
+    """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
+    (streams, bins), stages = traffic.come.shape, len(called)
     # The state: the stage that begins and when; for each the least cost until then, the queues, and whence.
     cost = np.full((bins + 1, stages), NEVER)
     queue = np.empty((bins, stages, streams))
     # Whence: when the stage before began, which it was, when it ended.
     whence = np.zeros((bins + 1, stages, 3), np.int64)
     cost[0, present] = 0.0
-    queue[0, present] = stand
+    queue[0, present] = traffic.stand
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
-    after = follows[:, :stages] & called & ~np.eye(stages, dtype=np.bool_)
+    after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     green, veh = np.empty(streams, np.int64), np.empty(streams)
     for begin in range(bins):
         for stage in range(stages):
@@ -149,40 +119,49 @@ def _search(  # noqa: C901, PLR0912 - one search, all in one place for the compi
             if spent >= best - ALIKE:
                 continue
             if begin > 0:
-                _lead(begin, stage, whence, serves, come, came, most, queue)
-            # What the queues weigh that move, and that have red.
+                _lead(begin, stage, low, whence, rules, traffic, queue)
+            # What the queues weigh that move, and that have red: these in `veh` as they stood when it began.
             greens, moving, held = 0, 0.0, 0.0
             for stream in range(streams):
-                weight = worth[stream] * queue[begin, stage, stream]
-                if serves[stage, stream]:
-                    green[greens], veh[greens] = stream, queue[begin, stage, stream]
+                veh[stream] = queue[begin, stage, stream]
+                weight = traffic.worth[stream] * veh[stream]
+                if rules.moves[low + stage, stream] > 0:
+                    green[greens] = stream
                     greens += 1
                     moving += weight
                 else:
                     held += weight
-            may_end = begin + least[stage] if begin > 0 else 0
+            may_end = begin + rules.least[low + stage] if begin > 0 else 0
             must_end = rest if begin == 0 else bins
             now = begin
             while now < bins and spent < best - ALIKE:
                 if now >= may_end:
-                    # It ends here: others begin after its clearance, where that is the best way there.
-                    opens = min(now + clearance[stage], bins)
-                    until = spent + _held(red, grown, paid, now, opens, held + moving)
+                    # It ends here: others begin after their clearance, where that is the best way there.
+                    won, won_in = 0.0, -1
                     for other in range(stages):
-                        if after[stage, other] and until < cost[opens, other] - ALIKE:
+                        opens = min(now + rules.clearance[low + stage, other], bins)
+                        if not after[stage, other] or spent >= cost[opens, other] - ALIKE:
+                            continue
+                        until = spent + _held(stages, traffic, now, opens, held + moving)
+                        row = rules.clearing[low + stage, other]
+                        if row >= 0:
+                            if row != won_in:
+                                won_in, won = row, _won(row, begin, low + stage, now, opens, veh, rules.moves, traffic)
+                            until -= won
+                        if until < cost[opens, other] - ALIKE:
                             cost[opens, other] = until
                             whence[opens, other, 0] = begin
                             whence[opens, other, 1] = stage
                             whence[opens, other, 2] = now
                     if now >= must_end:
                         break
-                spent += _held(stage, grown, paid, now, now + 1, held)
-                held += grown[stage, now + 1] - grown[stage, now]
+                spent += _held(stage, traffic, now, now + 1, held)
+                held += traffic.grown[stage, now + 1] - traffic.grown[stage, now]
                 moving = 0.0
                 for place in range(greens):
                     stream = green[place]
-                    veh[place] = max(veh[place] + come[stream, now] - most[stream], 0.0)
-                    moving += worth[stream] * veh[place]
+                    veh[stream] = max(veh[stream] + traffic.come[stream, now] - traffic.most[stream], 0.0)
+                    moving += traffic.worth[stream] * veh[stream]
                 spent, now = spent + moving, now + 1
             if now == bins and spent < best - ALIKE:
                 best, last_begin, last_stage = spent, begin, stage
@@ -190,17 +169,12 @@ def _search(  # noqa: C901, PLR0912 - one search, all in one place for the compi
         # Ways that end amid a clearance.
         if cost[bins, stage] < best - ALIKE:
             best, last_begin, last_stage = cost[bins, stage], bins, stage
-    return int(_trace(present, last_begin, last_stage, whence, plan)) if last_begin >= 0 else -1
+    return int(_trace(present, last_begin, last_stage, low, whence, rules.clearing, plan)) if last_begin >= 0 else -1
 
 
 @compiled
-def _sums(serves: Bools, come: Floats, soon: Floats, worth: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """What the costs of red are made of, all but the last of it up to each bin and no further.
-
-    (N, K + 1) who has come. For each stage, and last for clearances, (stages + 1, K + 1) what those weigh who have red
-    in it and have come, and what they have waited, if nobody had stood before. (N, K) what those lose in a bin of red
-    who come soon.
-    """
+def _sums(serves: Floats, stand: Floats, come: Floats, soon: Floats, worth: Floats, most: Floats) -> Traffic:
+    """The traffic with what the costs of red are made of."""
     stages, (streams, bins) = len(serves), come.shape
     came, slowed = np.zeros((streams, bins + 1)), np.zeros((streams, bins))
     grown, paid = np.zeros((stages + 1, bins + 1)), np.zeros((stages + 1, bins + 1))
@@ -211,78 +185,111 @@ def _sums(serves: Bools, come: Floats, soon: Floats, worth: Floats) -> tuple[Flo
             for place in range(bins - 1 - ahead):
                 slowed[stream, place] += soon[ahead] * come[stream, place + 1 + ahead]
         for stage in range(stages + 1):
-            if stage == stages or not serves[stage, stream]:
+            if stage == stages or serves[stage, stream] == 0:
                 for place in range(bins):
                     grown[stage, place + 1] += worth[stream] * came[stream, place + 1]
                     paid[stage, place + 1] += worth[stream] * (came[stream, place + 1] + slowed[stream, place])
     for stage in range(stages + 1):
         for place in range(bins):
             paid[stage, place + 1] += paid[stage, place]
-    return came, grown, paid, slowed
+    return Traffic(stand, come, came, slowed, grown, paid, worth, most)
 
 
 @compiled
-def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weight: float) -> float:
+def _held(stage: int, traffic: Traffic, since: int, until: int, weight: float) -> float:
     """What those wait in some bins who have red in a stage, and of whom so much stood before."""
-    return float(paid[stage, until] - paid[stage, since] + (until - since) * (weight - grown[stage, since]))
+    grown, paid = traffic.grown[stage], traffic.paid[stage]
+    return float(paid[until] - paid[since] + (until - since) * (weight - grown[since]))
 
 
 @compiled
-def _lead(
-    begin: int, stage: int, whence: Ints, serves: Bools, come: Floats, came: Floats, most: Floats, queue: Floats
-) -> None:
+def _won(row: int, begin: int, stage: int, end: int, until: int, veh: Floats, moves: Floats, traffic: Traffic) -> float:
+    """What is waited less in a clearance than if all had red, by its `row` and the one of the `stage` before it.
+
+    `veh` (n,) who stands at its `end`; of those who have red in it, at its `begin`.
+    """
+    won = 0.0
+    for stream in range(len(veh)):
+        if moves[row : row + until - end, stream].sum() == 0:
+            continue
+        queue = veh[stream]
+        if moves[stage, stream] == 0:
+            queue += traffic.came[stream, end] - traffic.came[stream, begin]
+        red, less = queue, 0.0
+        for place in range(end, until):
+            red += traffic.come[stream, place]
+            queue += traffic.come[stream, place]
+            share = moves[row + place - end, stream]
+            if share > 0:
+                queue = max(queue - share * traffic.most[stream], 0.0)
+                less += traffic.slowed[stream, place]
+            less += red - queue
+        won += traffic.worth[stream] * less
+    return won
+
+
+@compiled
+def _lead(begin: int, stage: int, low: int, whence: Ints, rules: Rules, traffic: Traffic, queue: Floats) -> None:
     """Fills in the queues when a stage begins, by those when the stage before it did."""
     before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
-    for stream in range(len(most)):
+    row = rules.clearing[low + was, stage]
+    for stream in range(len(traffic.most)):
         veh, since = queue[before, was, stream], before
-        if serves[was, stream]:
+        if rules.moves[low + was, stream] > 0:
             for place in range(before, end):
-                veh = max(veh + come[stream, place] - most[stream], 0.0)
+                veh = max(veh + traffic.come[stream, place] - traffic.most[stream], 0.0)
             since = end
-        queue[begin, stage, stream] = veh + came[stream, begin] - came[stream, since]
+        if row >= 0 and rules.moves[row : row + begin - end, stream].sum() > 0:
+            veh += traffic.came[stream, end] - traffic.came[stream, since]
+            for place in range(end, begin):
+                leaves = rules.moves[row + place - end, stream] * traffic.most[stream]
+                veh = max(veh + traffic.come[stream, place] - leaves, 0.0)
+            since = begin
+        queue[begin, stage, stream] = veh + traffic.came[stream, begin] - traffic.came[stream, since]
 
 
 @compiled
-def _waited(
-    plan: Ints, serves: Bools, stand: Floats, come: Floats, slowed: Floats, worth: Floats, most: Floats
-) -> float:
+def _waited(plan: Ints, moves: Floats, traffic: Traffic) -> float:
     """What is waited by a `plan`."""
     total = 0.0
-    for stream in range(len(stand)):
-        veh, waited = stand[stream], 0.0
+    for stream in range(len(traffic.stand)):
+        veh, waited = traffic.stand[stream], 0.0
         for place in range(len(plan)):
-            veh += come[stream, place]
-            if plan[place] >= 0 and serves[plan[place], stream]:
-                veh = max(veh - most[stream], 0.0)
+            veh += traffic.come[stream, place]
+            share = moves[plan[place], stream] if plan[place] >= 0 else 0.0
+            if share > 0:
+                veh = max(veh - share * traffic.most[stream], 0.0)
             else:
-                waited += slowed[stream, place]
+                waited += traffic.slowed[stream, place]
             waited += veh
-        total += worth[stream] * waited
+        total += traffic.worth[stream] * waited
     return total
 
 
 @compiled
-def _trace(present: int, begin: int, stage: int, whence: Ints, plan: Ints) -> int:
+def _trace(present: int, begin: int, stage: int, low: int, whence: Ints, clearing: Ints, plan: Ints) -> int:
     """The stage that is led to in the first bin of the way whose last stage began at `begin`, and into `plan` all."""
     now, chosen = len(plan), present
     while True:
-        plan[begin:now] = stage
+        plan[begin:now] = low + stage
         if begin == 0:
             return chosen
         before, was, now = whence[begin, stage]
-        plan[now:begin] = -1
+        row = clearing[low + was, stage]
+        for place in range(now, begin):
+            plan[place] = row + place - now if row >= 0 else -1
         if now == 0:
             chosen = stage
         begin, stage = before, was
 
 
 @compiled
-def _send_off(plan: Ints, serves: Bools, stand: Floats, come: Floats, most: Floats, sent: Floats) -> None:
+def _send_off(plan: Ints, moves: Floats, stand: Floats, come: Floats, most: Floats, sent: Floats) -> None:
     """Fills `sent` with what leaves by a `plan`."""
     for stream in range(len(stand)):
         veh = stand[stream]
-        for place, stage in enumerate(plan):
+        for place, row in enumerate(plan):
             veh += come[stream, place]
-            leaves = min(veh, most[stream]) if stage >= 0 and serves[stage, stream] else 0.0
+            leaves = min(veh, moves[row, stream] * most[stream]) if row >= 0 else 0.0
             sent[stream, place] = leaves
             veh -= leaves

@@ -47,6 +47,14 @@ class Streams:
         """(J + 1,) where the junctions' streams begin."""
         self.serves = network.serves[np.ix_(self.stage, one)]
         """(S, N) whether a stage gives a stream green."""
+        letters: list[set[int]] = [set() for _ in one]
+        stream_of = dict(zip(self._turns.tolist(), of_turn, strict=True))
+        for junction in network.junctions:
+            for letter, turns in enumerate(junction.signal_turns):
+                for turn in turns:
+                    letters[stream_of[turn]].add(letter)
+        self.letters = [tuple(sorted(own)) for own in letters]
+        """(N,) the letters of its junction that each has green by."""
 
     def shares(self, fraction: Floats) -> tuple[Floats, Floats]:
         """(N,) each stream's share of its link's traffic, and of its lane group's, by the turning fractions (M,)."""

@@ -260,12 +260,12 @@ class SumoPlant:
         heads.advance(self.time_s)
         if self.time_s >= self._decision_s:
             free = heads.free(self.time_s)
-            if free.any():
-                view = Sight(self._eyes, heads, self.time_s, free)
-                wish = heads.patient(self._wish(execution, view), view)
-                if wish is not view.stage:
-                    for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
-                        heads.switch(index, int(wish[index]), self.time_s)
+            # An execution that keeps in mind who has come looks every time, though no junction may be free.
+            view = Sight(self._eyes, heads, self.time_s, free)
+            wish = heads.patient(self._wish(execution, view), view)
+            if wish is not view.stage:
+                for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
+                    heads.switch(index, int(wish[index]), self.time_s)
             self._decision_s += execution.every_s
         self.decision_time_s += time.perf_counter() - started
         return min(self._decision_s, heads.next_s)

@@ -1,0 +1,85 @@
+"""What moves at a junction in each bin of a stage, and of the clearance from any stage to any other.
+
+Many a clearance is no red for all: vehicles go on while who walks is cleared, a stream that the next stage serves too
+keeps its green, another has it a little before its stage.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from utn_controllers.scheduled.streams import Streams
+from utn_sumo import clearances
+from utn_sumo.clearances import GREEN, Phases, Times
+from utn_sumo.contract import Bools, Floats, Ints, Network
+
+
+class Rules(NamedTuple):
+    """What junctions (J) may show, by stages (S), and what moves then, by rows (R) of which the first are the stages'.
+
+    Junctions' stages and streams (N) are those of Streams.
+    """
+
+    stages: Ints
+    """(S,) the network's stage of each row."""
+    first_stage: Ints
+    """(J + 1,) rows where the junctions' stages begin."""
+    first: Ints
+    """(J + 1,) where the junctions' streams begin."""
+    follows: Bools
+    """(S, most stages of a junction) whether its junction's nth may come after a stage."""
+    moves: Floats
+    """(R, most streams of a junction) share of its discharge that each has."""
+    clearing: Ints
+    """(S, most stages of a junction) row of the first bin of the clearance to its junction's nth, -1 if all is red."""
+    clearance: Ints
+    """(S, most stages of a junction) bins of that clearance: one or more."""
+    least: Ints
+    """(S,) bins of green, one or more."""
+
+
+class Moves:
+    """Which share of its discharge each stream of a junction has, by bins, in rows (R): the stages', clearances'."""
+
+    def __init__(self, network: Network, streams: Streams, bin_s: int):
+        sizes, most = np.diff(streams.first), int(np.diff(streams.first_stage).max(initial=1))
+        owner = network.stage_junction[streams.stage]
+        rows = [
+            serves[streams.first[j] : streams.first[j + 1]] for j, serves in zip(owner, streams.serves, strict=True)
+        ]
+        self.row = np.full((len(owner), most), -1)
+        """(S, most stages of a junction) where the clearance from a stage to its junction's nth begins, -1: all red."""
+        self.bins = np.ones((len(owner), most), dtype=np.int64)
+        """(S, most stages of a junction) its bins."""
+        for index, junction in enumerate(network.junctions):
+            letters = streams.letters[streams.first[index] : streams.first[index + 1]]
+            times = Times.of(network, junction)
+            for row, first in enumerate(junction.stages, start=streams.first_stage[index]):
+                known: dict[bytes, int] = {}
+                for place, then in enumerate(junction.stages):
+                    if first != then:
+                        phases = clearances.between(network, junction, times, first, then)
+                        shares = _shares(phases, letters, bin_s)
+                        self.bins[row, place] = len(shares)
+                        if shares.any():
+                            self.row[row, place] = known.setdefault(shares.tobytes(), len(rows))
+                            if self.row[row, place] == len(rows):
+                                rows.extend(shares)
+        self.share = np.zeros((len(rows), int(sizes.max(initial=0))))
+        """(R, most streams of a junction)."""
+        for number, row in enumerate(rows):
+            self.share[number, : len(row)] = row
+
+
+def _shares(phases: Phases, letters: list[tuple[int, ...]], bin_s: int) -> Floats:
+    """(bins, streams) share of each bin of a clearance in which the streams with these letters have green."""
+    states = [state for state, seconds in phases for _ in range(round(seconds))]
+    bins = max(int(len(states) / bin_s + 0.5), 1)
+    # Short ones are rounded up: what they end with goes on.
+    states = [*states, *states[-1:] * (bins * bin_s)][: bins * bin_s]
+    green = [[all(state[letter] in GREEN for letter in own) for own in letters] for state in states]
+    if not green:
+        return np.zeros((bins, len(letters)))
+    return np.asarray(np.reshape(green, (bins, bin_s, len(letters))).mean(axis=1))
