@@ -102,7 +102,9 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     present: int, rest: int, low: int, called: Bools, rules: Rules, traffic: Traffic, limit: float, plan: Ints
 ) -> int:
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
-    (streams, bins), stages = traffic.come.shape, len(called)
+    come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
+    moves, clearance, least = rules.moves, rules.clearance, rules.least
+    (streams, bins), stages = come.shape, len(called)
     # The state: the stage that begins and when; for each the least cost until then, the queues, and whence.
     cost = np.full((bins + 1, stages), NEVER)
     queue = np.empty((bins, stages, streams))
@@ -124,30 +126,27 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
             greens, moving, held = 0, 0.0, 0.0
             for stream in range(streams):
                 veh[stream] = queue[begin, stage, stream]
-                weight = traffic.worth[stream] * veh[stream]
-                if rules.moves[low + stage, stream] > 0:
-                    green[greens] = stream
-                    greens += 1
+                weight = worth[stream] * veh[stream]
+                if moves[low + stage, stream] > 0:
+                    green[greens], greens = stream, greens + 1
                     moving += weight
                 else:
                     held += weight
-            may_end = begin + rules.least[low + stage] if begin > 0 else 0
-            must_end = rest if begin == 0 else bins
+            may_end, must_end = (begin + least[low + stage], bins) if begin > 0 else (0, rest)
             now = begin
             while now < bins and spent < best - ALIKE:
                 if now >= may_end:
                     # It ends here: others begin after their clearance, where that is the best way there.
                     won, won_in = 0.0, -1
                     for other in range(stages):
-                        opens = min(now + rules.clearance[low + stage, other], bins)
+                        opens = min(now + clearance[low + stage, other], bins)
                         if not after[stage, other] or spent >= cost[opens, other] - ALIKE:
                             continue
-                        until = spent + _held(stages, traffic, now, opens, held + moving)
+                        until = spent + _held(stages, grown, paid, now, opens, held + moving)
                         row = rules.clearing[low + stage, other]
-                        if row >= 0:
-                            if row != won_in:
-                                won_in, won = row, _won(row, begin, low + stage, now, opens, veh, rules.moves, traffic)
-                            until -= won
+                        if row not in (-1, won_in):
+                            won_in, won = row, _won(row, begin, low + stage, now, opens, veh, moves, traffic)
+                        until -= won if row >= 0 else 0.0
                         if until < cost[opens, other] - ALIKE:
                             cost[opens, other] = until
                             whence[opens, other, 0] = begin
@@ -155,13 +154,13 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                             whence[opens, other, 2] = now
                     if now >= must_end:
                         break
-                spent += _held(stage, traffic, now, now + 1, held)
-                held += traffic.grown[stage, now + 1] - traffic.grown[stage, now]
+                spent += _held(stage, grown, paid, now, now + 1, held)
+                held += grown[stage, now + 1] - grown[stage, now]
                 moving = 0.0
                 for place in range(greens):
                     stream = green[place]
-                    veh[stream] = max(veh[stream] + traffic.come[stream, now] - traffic.most[stream], 0.0)
-                    moving += traffic.worth[stream] * veh[stream]
+                    veh[stream] = max(veh[stream] + come[stream, now] - most[stream], 0.0)
+                    moving += worth[stream] * veh[stream]
                 spent, now = spent + moving, now + 1
             if now == bins and spent < best - ALIKE:
                 best, last_begin, last_stage = spent, begin, stage
@@ -196,21 +195,17 @@ def _sums(serves: Floats, stand: Floats, come: Floats, soon: Floats, worth: Floa
 
 
 @compiled
-def _held(stage: int, traffic: Traffic, since: int, until: int, weight: float) -> float:
+def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weight: float) -> float:
     """What those wait in some bins who have red in a stage, and of whom so much stood before."""
-    grown, paid = traffic.grown[stage], traffic.paid[stage]
-    return float(paid[until] - paid[since] + (until - since) * (weight - grown[since]))
+    return float(paid[stage, until] - paid[stage, since] + (until - since) * (weight - grown[stage, since]))
 
 
 @compiled
 def _won(row: int, begin: int, stage: int, end: int, until: int, veh: Floats, moves: Floats, traffic: Traffic) -> float:
-    """What is waited less in a clearance than if all had red, by its `row` and the one of the `stage` before it.
-
-    `veh` (n,) who stands at its `end`; of those who have red in it, at its `begin`.
-    """
+    """What is waited less in a clearance than if all had red; `veh` of who had red already as the `stage` began."""
     won = 0.0
     for stream in range(len(veh)):
-        if moves[row : row + until - end, stream].sum() == 0:
+        if not _goes(moves, row, until - end, stream):
             continue
         queue = veh[stream]
         if moves[stage, stream] == 0:
@@ -229,6 +224,15 @@ def _won(row: int, begin: int, stage: int, end: int, until: int, veh: Floats, mo
 
 
 @compiled
+def _goes(moves: Floats, row: int, bins: int, stream: int) -> bool:
+    """Whether a stream has green in any bin of a clearance."""
+    share = 0.0
+    for place in range(row, row + bins):
+        share += moves[place, stream]
+    return share > 0
+
+
+@compiled
 def _lead(begin: int, stage: int, low: int, whence: Ints, rules: Rules, traffic: Traffic, queue: Floats) -> None:
     """Fills in the queues when a stage begins, by those when the stage before it did."""
     before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
@@ -239,7 +243,7 @@ def _lead(begin: int, stage: int, low: int, whence: Ints, rules: Rules, traffic:
             for place in range(before, end):
                 veh = max(veh + traffic.come[stream, place] - traffic.most[stream], 0.0)
             since = end
-        if row >= 0 and rules.moves[row : row + begin - end, stream].sum() > 0:
+        if row >= 0 and _goes(rules.moves, row, begin - end, stream):
             veh += traffic.came[stream, end] - traffic.came[stream, since]
             for place in range(end, begin):
                 leaves = rules.moves[row + place - end, stream] * traffic.most[stream]
