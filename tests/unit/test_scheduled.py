@@ -73,7 +73,6 @@ class Crossing:
         rest: int | None = None,
         most: object = 1.0,
         worth: object = 1.0,
-        soon: Floats | None = None,
         free: bool = True,
         plan: Ints | None = None,
         sent: Floats | None = None,
@@ -89,7 +88,6 @@ class Crossing:
             self.rules(),
             np.zeros(stages) + np.array(stand, dtype=float),
             np.zeros((stages, self.bins)) if come is None else come,
-            np.zeros(4) if soon is None else soon,
             np.zeros(stages) + np.array(worth, dtype=float),
             np.zeros(stages) + np.array(most, dtype=float),
             plan[None].copy(),
@@ -143,20 +141,14 @@ def waited(shown: list[int], stand: list[float], come: list[list[float]], worth:
 Drawn = tuple[Crossing, list[float], list[list[float]], list[float], float]
 
 
-def a_bin(green: Floats, place: int, queue: Floats, drawn: Drawn, soon: Floats) -> tuple[float, Floats]:
-    """What is waited in a bin of which streams have the share `green`, with those who brake before red; the queues."""
+def a_bin(green: Floats, place: int, queue: Floats, drawn: Drawn) -> tuple[float, Floats]:
+    """What is waited in a bin of which streams have the share `green`; the queues."""
     _, _, come, worth, most = drawn
-    queue, cost = queue + np.array(come)[:, place], 0.0
-    for stream, share in enumerate(green):
-        if share > 0:
-            queue[stream] = max(queue[stream] - share * most, 0.0)
-        else:
-            ahead = come[stream][place + 1 : place + 1 + len(soon)]
-            cost += worth[stream] * float(soon[: len(ahead)] @ ahead)
-    return cost + float(np.array(worth) @ queue), queue
+    queue = np.maximum(queue + np.array(come)[:, place] - green * most, 0.0)
+    return float(np.array(worth) @ queue), queue
 
 
-def plainly(drawn: Drawn, soon: Floats, rest: int) -> tuple[set[int], float]:
+def plainly(drawn: Drawn, rest: int) -> tuple[set[int], float]:
     """The same programme, each bin gone through anew for each way: what may be led to first, and the least cost."""
     crossing, stand = drawn[0], np.array(drawn[1])
     bins, stages, ends = crossing.bins, len(stand), list[tuple[float, int]]()
@@ -175,12 +167,12 @@ def plainly(drawn: Drawn, soon: Floats, rest: int) -> tuple[set[int], float]:
                         continue
                     until, cleared, opens = spent, queue, now
                     for green in crossing.cleared(stage, other)[: bins - now]:
-                        cost, cleared = a_bin(green, opens, cleared, drawn, soon)
+                        cost, cleared = a_bin(green, opens, cleared, drawn)
                         until, opens = until + cost, opens + 1
                     if until < states.get((opens, other), (np.inf,))[0] - 1e-9:
                         states[opens, other] = until, cleared, other if now == 0 else first
             if now < last:
-                cost, queue = a_bin(np.eye(stages)[stage], now, queue, drawn, soon)
+                cost, queue = a_bin(np.eye(stages)[stage], now, queue, drawn)
                 spent += cost
     ends += [(cost, first) for (begin, _), (cost, _, first) in states.items() if begin == bins]
     least = min(ends, key=lambda end: end[0])[0]
@@ -260,20 +252,16 @@ class TestProgramme:
         assert other_wish == wish
         assert (other_sent == sent).all()
 
-    @given(drawn=holding(), rest=st.integers(0, 10), soon=st.sampled_from([0.0, 0.3, 2.0]))
-    def test_it_finds_what_the_programme_finds_without_sums_and_bounds(
-        self, drawn: Drawn, rest: int, soon: float
-    ) -> None:
+    @given(drawn=holding(), rest=st.integers(0, 10))
+    def test_it_finds_what_the_programme_finds_without_sums_and_bounds(self, drawn: Drawn, rest: int) -> None:
         crossing, stand, come, worth, most = drawn
         assume(sum(stand[1:]) + np.sum(come[1:]) > 0)
-        slowing = np.array([soon, soon / 2])
-        wish, sent = crossing.decide(stand, np.array(come), rest=rest, worth=worth, most=most, soon=slowing)
-        found, cost = plainly(drawn, slowing, rest)
+        wish, sent = crossing.decide(stand, np.array(come), rest=rest, worth=worth, most=most)
+        found, cost = plainly(drawn, rest)
         left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
         planned = float(np.array(worth) @ left_veh.sum(axis=1))
         assert wish in found
-        assert planned <= cost + 1e-6
-        assert soon or planned == pytest.approx(cost, abs=1e-6)
+        assert planned == pytest.approx(cost, abs=1e-6)
 
     def test_with_nobody_anywhere_the_present_stage_stays(self) -> None:
         for stage in range(3):
@@ -295,17 +283,6 @@ class TestProgramme:
         (end, stage, _), *_ = crossing.begins([0.0, 0.0], come, most=2.0)
         assert stage == 0
         assert end + crossing.clearance[0] == arrives
-
-    def test_a_vehicle_that_would_brake_finds_green_earlier(self) -> None:
-        come = np.zeros((2, 25))
-        come[1, 4] = 1.0
-        slowing = np.array([0.3, 0.3, 0.0, 0.0])
-        crossing = Crossing()
-        # Two bins of clearance, and two more in which it would be slowed.
-        assert crossing.decide(0.0, come, soon=slowing)[0] == 1
-        come = np.roll(come, 1, axis=1)
-        come[0, 0] = 0.5
-        assert crossing.decide(0.0, come, soon=slowing)[0] == 0
 
     def test_who_stands_alone_before_red_is_let_go_at_once(self) -> None:
         wish, sent = Crossing().decide([0.0, 1.0])
@@ -543,7 +520,8 @@ class TestExecution:
         for bounds, leaves in (("none", False), ("plan", True)):
             execution = Scheduled(utn17, bounds=bounds)
             execution.begin(plan, Estimator(utn17, utn17).initial())
-            view = replace(scene(utn17, 500.0), zone_veh=by_the_line(near_veh))
+            went_veh = np.ones(len(utn17.links))
+            view = replace(scene(utn17, 500.0), zone_veh=by_the_line(near_veh), left_veh=went_veh)
             assert (execution.wish(view) != view.stage).all() == leaves
             # It has not been reached yet.
             view = replace(view, time_s=2.0)
@@ -575,11 +553,11 @@ class TestExecution:
 
         def stay(now_s: float, begin_s: Floats) -> bool:
             left_veh = np.full(len(utn17.links), now_s * goes)
-            view = replace(scene(utn17, now_s), near_veh=near_veh, left_veh=left_veh, begin_s=begin_s)
+            zone_veh = by_the_line(near_veh)
+            view = replace(scene(utn17, now_s), zone_veh=zone_veh, left_veh=left_veh, begin_s=begin_s)
             return bool((execution.wish(view) == view.stage).all())
 
-        # It takes a while until who has come into sight stands.
-        assert all(stay(now_s, begin_s) for now_s in np.arange(0.0, 38.0, 2.0))
+        assert all(stay(now_s, begin_s) for now_s in np.arange(30.0, 38.0, 2.0))
         assert stay(38.0, begin_s) == stays
         # A new green has as long again.
         assert stay(40.0, begin_s + 10.0)

@@ -18,8 +18,6 @@ from utn_sumo.contract import EXIT, ZONES_M, Bools, Floats, Ints, Network, Plan,
 
 BIN_S = 2
 """Length of a bin, and time between two decisions."""
-SOON_FADING = np.array([1.0, 0.9, 0.81, 0.73])
-"""What a vehicle loses by red in each bin before its arrival, over the last one's."""
 FADING = 0.2
 """Over what share of its storage about `full` a link is fed less and less."""
 LEAST_WORTH = 0.05
@@ -29,10 +27,7 @@ BLOCKED_VEH = 1e-6
 
 
 class ScheduledSettings(BaseModel):
-    """Settings of `scheduled`, found on `utn17` (0.3 to 1.3), cologne8 and ingolstadt7 with seeds 1 to 3.
-
-    But for `standstill_s`: on the nets of tools/tuning_nets.py.
-    """
+    """Settings of `scheduled`, found on the nets of tools/tuning_nets.py and `utn17` with seeds 1 to 3."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -42,13 +37,11 @@ class ScheduledSettings(BaseModel):
     """Whether a green lasts no longer than the plan has it where others wait."""
     horizon_s: float = Field(50.0, ge=10, le=200)
     """How far ahead a schedule goes [s]."""
-    discharge: float = Field(1.4, gt=0, le=3)
+    discharge: float = Field(1.2, gt=0, le=3)
     """Over the saturation flow, which is that of long queues with their start: what a queue leaves with."""
-    slowing_s: float = Field(0.3, ge=0, le=20)
-    """What a vehicle loses by each two seconds of red before it reaches the stop line [s]."""
     crowding: float = Field(0.4, ge=0, le=20)
     """By how much waiting on a full link costs more than on an empty one, in vehicles."""
-    full: float = Field(0.5, gt=0, le=2)
+    full: float = Field(0.45, gt=0, le=2)
     """Share of its storage about which a link is fed less and less: beyond it some lane is full and stops all."""
     standstill_s: float = Field(8.0, ge=2, le=200)
     """How long a queue may have green and nobody go before others are served [s]."""
@@ -79,7 +72,6 @@ class Scheduled:
             moves.bins,
             np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
         )
-        self._soon = self.settings.slowing_s / BIN_S * SOON_FADING
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules."""
         self._endless = np.full(len(network.junctions), bins)
@@ -121,7 +113,6 @@ class Scheduled:
                 self._rules,
                 stand,
                 come,
-                self._soon,
                 worth,
                 most,
                 self._plan,

@@ -26,14 +26,13 @@ ALIKE = 1e-9
 
 @compiled
 def schedules(
-    stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, soon: Floats, worth: Floats,
+    stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats,
     most: Floats, plan: Ints, sent: Floats,
 ) -> Ints:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
-    `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `soon` (n,) what it
-    costs to show an arriving vehicle red in each bin before its arrival; `worth` (N,) weight of a vehicle, `most` (N,)
-    that leave in a bin of green.
+    `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
+    weight of a vehicle, `most` (N,) that leave in a bin of green.
 
     `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
@@ -51,7 +50,7 @@ def schedules(
             present += 1
         stages = rules.first_stage[junction + 1] - low
         chosen = _schedule(
-            present, rest[junction], low, stages, rules, stand[a:b], come[a:b], soon, worth[a:b], most[a:b],
+            present, rest[junction], low, stages, rules, stand[a:b], come[a:b], worth[a:b], most[a:b],
             plan[junction], sent[a:b],
         )  # fmt: skip
         wish[junction] = rules.stages[low + chosen]
@@ -60,14 +59,14 @@ def schedules(
 
 @compiled
 def _schedule(
-    present: int, rest: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats, soon: Floats,
+    present: int, rest: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats,
     worth: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on."""
     chosen = present
     called = _called(present, low, stages, rules, stand, come)
     if called.any():
-        traffic = _sums(rules.moves[low : low + stages], stand, come, soon, worth, most)
+        traffic = _sums(rules.moves[low : low + stages], stand, come, worth, most)
         # What was best a bin ago is seldom far from what is best now.
         known = _waited(plan, rules.moves, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
@@ -172,26 +171,22 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
 
 
 @compiled
-def _sums(serves: Floats, stand: Floats, come: Floats, soon: Floats, worth: Floats, most: Floats) -> Traffic:
+def _sums(serves: Floats, stand: Floats, come: Floats, worth: Floats, most: Floats) -> Traffic:
     """The traffic with what the costs of red are made of."""
     stages, (streams, bins) = len(serves), come.shape
-    came, slowed = np.zeros((streams, bins + 1)), np.zeros((streams, bins))
+    came = np.zeros((streams, bins + 1))
     grown, paid = np.zeros((stages + 1, bins + 1)), np.zeros((stages + 1, bins + 1))
     for stream in range(streams):
         for place in range(bins):
             came[stream, place + 1] = came[stream, place] + come[stream, place]
-        for ahead in range(min(len(soon), bins)):
-            for place in range(bins - 1 - ahead):
-                slowed[stream, place] += soon[ahead] * come[stream, place + 1 + ahead]
         for stage in range(stages + 1):
             if stage == stages or serves[stage, stream] == 0:
                 for place in range(bins):
                     grown[stage, place + 1] += worth[stream] * came[stream, place + 1]
-                    paid[stage, place + 1] += worth[stream] * (came[stream, place + 1] + slowed[stream, place])
     for stage in range(stages + 1):
         for place in range(bins):
-            paid[stage, place + 1] += paid[stage, place]
-    return Traffic(stand, come, came, slowed, grown, paid, worth, most)
+            paid[stage, place + 1] = paid[stage, place] + grown[stage, place + 1]
+    return Traffic(stand, come, came, grown, paid, worth, most)
 
 
 @compiled
@@ -217,7 +212,6 @@ def _won(row: int, begin: int, stage: int, end: int, until: int, veh: Floats, mo
             share = moves[row + place - end, stream]
             if share > 0:
                 queue = max(queue - share * traffic.most[stream], 0.0)
-                less += traffic.slowed[stream, place]
             less += red - queue
         won += traffic.worth[stream] * less
     return won
@@ -263,8 +257,6 @@ def _waited(plan: Ints, moves: Floats, traffic: Traffic) -> float:
             share = moves[plan[place], stream] if plan[place] >= 0 else 0.0
             if share > 0:
                 veh = max(veh - share * traffic.most[stream], 0.0)
-            else:
-                waited += traffic.slowed[stream, place]
             waited += veh
         total += traffic.worth[stream] * waited
     return total

@@ -16,8 +16,6 @@ class Traffic(NamedTuple):
     """(n, K) vehicles."""
     came: Floats
     """(n, K + 1) sum of these."""
-    slowed: Floats
-    """(n, K) what those lose in a bin of red who come soon."""
     grown: Floats
     """(s + 1, K + 1) sum of what those weigh who have come and have red in a stage; in the last row, of all."""
     paid: Floats
