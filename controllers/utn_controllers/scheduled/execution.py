@@ -41,7 +41,7 @@ class ScheduledSettings(BaseModel):
     """Over the saturation flow, which is that of long queues with their start: what a queue leaves with."""
     crowding: float = Field(0.4, ge=0, le=20)
     """By how much waiting on a full link costs more than on an empty one, in vehicles."""
-    full: float = Field(0.45, gt=0, le=2)
+    full: float = Field(0.4, gt=0, le=2)
     """Share of its storage about which a link is fed less and less: beyond it some lane is full and stops all."""
     standstill_s: float = Field(8.0, ge=2, le=200)
     """How long a queue may have green and nobody go before others are served [s]."""
