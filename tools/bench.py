@@ -7,6 +7,7 @@
     python tools/bench.py estimate     vehicles estimated from loops that miscount: counting against the filter
     python tools/bench.py forecast     STARIMA: time to fit, and to update and forecast each cycle
     python tools/bench.py foresight    what forecasts are worth in closed loop, against perfect ones
+    python tools/bench.py bound        delay on a net that no controller can go below
     python tools/bench.py scale        a net of 1,000 signals: time to read it, and to step its model
 
 Each prints a table, or with --json one object (traffic, step, estimate and foresight: a list of objects).
@@ -31,13 +32,26 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import bounding
 import comparing
 import forecasting
 import foreign
 import showing
 import solving
-from utn_sumo import bridge, calibration, campaign, mismatch, network, recording, replay, report, sumo_tools
+from utn_sumo import (
+    bridge,
+    calibration,
+    campaign,
+    mismatch,
+    network,
+    recording,
+    replay,
+    report,
+    streets,
+    sumo_tools,
+)
 from utn_sumo.contract import Measurement
+from utn_sumo.demand import mean_profile_veh_h
 from utn_sumo.detectors import Miscount
 from utn_sumo.errors import UtnError
 from utn_sumo.estimation import Estimator
@@ -347,6 +361,29 @@ def scale(side: int, as_json: bool) -> None:
         return
     rows = [[name, f"{value:.3g}" if isinstance(value, float) else str(value)] for name, value in found.items()]
     _show(f"netgenerate grid of {side} x {side} signals", ["", ""], rows)
+
+
+@bench.command()
+@click.option("--net", default="utn17", show_default=True)
+@click.option("--hours", default=2.0, show_default=True)
+@click.option("--demands", default="1.0,1.2,1.3,1.5", show_default=True)
+@click.option("--lost", default="0.05,0.08,0.11", show_default=True, help="Shares of the time with no green.")
+@click.option("--json", "as_json", is_flag=True)
+def bound(net: str, hours: float, demands: str, lost: str, as_json: bool) -> None:
+    """Delay that no controller can go below: the linear programme of tools/bounding.py."""
+    found = streets.named(net)
+    rows = [
+        {"demand": float(scale), "lost": float(share), "least_delay_veh_h": bounding.least_delay_veh_h(
+            found, mean_profile_veh_h(found, "peak", round(hours * 30), float(scale)), hours, step_s=20.0,
+            lost=float(share),
+        )}
+        for scale in _words(demands) for share in _words(lost)
+    ]  # fmt: skip
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    cells = [[f"{row['demand']:g}", f"{row['lost']:.0%}", f"{row['least_delay_veh_h']:.0f}"] for row in rows]
+    _show(f"no less delay on {net}, {hours:g} h", ["demand", "time lost", "veh h"], cells)
 
 
 def _words(text: str) -> list[str]:

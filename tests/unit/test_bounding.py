@@ -1,0 +1,51 @@
+"""A bound on delay: what queues at a bottleneck, counted by hand, and never more than a controller needs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bounding
+from utn_sumo import bridge
+from utn_sumo.contract import EXIT, Network
+from utn_sumo.scenario import scenario
+
+STEP_S = 20.0
+
+
+def bound(network: Network, demand_veh_h: float, lost: float, hours: float = 0.5) -> float:
+    """Under a constant demand at every source."""
+    return bounding.least_delay_veh_h(
+        network, demand_veh_h * network.is_source[None, :], hours, step_s=STEP_S, lost=lost
+    )
+
+
+def test_who_comes_to_one_junction_too_fast_queues_as_counted_by_hand(utn17: Network) -> None:
+    link, hours, lost = int(np.flatnonzero(utn17.is_source)[0]), 0.5, 0.1
+    # They all leave the network, so that none comes round again.
+    first = int(np.flatnonzero((utn17.turn_link == link) & (utn17.turn_next == EXIT))[0])
+    turns = [
+        replace(turn, fraction=float(place == first)) if turn.link == link else turn
+        for place, turn in enumerate(utn17.turns)
+    ]
+    utn17 = replace(utn17, turns=tuple(turns))
+    capacity_veh_h = 3600 * utn17.saturation_flow_veh_s[link] * (1 - lost)
+    rate_veh_h = np.zeros((1, len(utn17.links)))
+    rate_veh_h[0, link] = 2 * capacity_veh_h
+    least = bounding.least_delay_veh_h(utn17, rate_veh_h, hours, step_s=STEP_S, lost=lost)
+    # Twice as many come as can go, and at any time as many drive freely as go in the time of the way.
+    assert least == pytest.approx(capacity_veh_h * hours**2 / 2, rel=0.03)
+
+
+def test_it_is_nothing_in_light_traffic_and_grows_with_demand_and_time_lost(utn17: Network) -> None:
+    assert bound(utn17, 200, 0.1) == pytest.approx(0.0, abs=1e-6)
+    assert 0 < bound(utn17, 1100, 0.05) < bound(utn17, 1300, 0.05) < bound(utn17, 1300, 0.15)
+
+
+def test_a_run_has_more_delay(utn17: Network, tmp_path: Path) -> None:
+    chosen = scenario(profile="constant", demand=1.5, hours=0.5)
+    result = bridge.run(chosen, tmp_path / "run")
+    assert bound(utn17, 1.5 * 800, 0.05) < result["total_delay_veh_h"]

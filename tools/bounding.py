@@ -1,0 +1,82 @@
+"""A bound below every controller's delay: traffic as a fluid, the future known, green shared out without a cycle.
+
+A linear programme over the whole run. Nobody waits at a red that the junction has time to spare for, nobody loses time
+by starting or braking, storage is kept, and links discharge at the saturation flows that were calibrated. All that is
+charged is a share of the time that goes to clearances. What is left is delay that no control can take away: more
+vehicles than the junctions can serve.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.optimize import linprog
+
+from utn_sumo.contract import EXIT, Floats, Network
+from utn_sumo.errors import UtnError
+
+
+def least_delay_veh_h(network: Network, demand_veh_h: Floats, hours: float, *, step_s: float, lost: float) -> float:
+    """Delay [veh h] that is not to be gone below in a run of so many hours.
+
+    `demand_veh_h` (steps, Z) at the sources, the steps of equal length; `step_s` that of the programme's own steps,
+    `lost` share of each junction's time in which nobody has green. Its turning fractions are the network's.
+    """
+    count, links, stages = round(hours * 3600 / step_s), len(network.links), len(network.stages)
+    sources = np.flatnonzero(network.is_source)
+    arriving = np.repeat(demand_veh_h[:, sources], -(-count // len(demand_veh_h)), axis=0)[:count] * step_s / 3600
+    onward = np.zeros((links, links))
+    inside = network.turn_next != EXIT
+    np.add.at(onward, (network.turn_next[inside], network.turn_link[inside]), network.fraction[inside])
+    entry = np.eye(links)[:, sources]
+    steps, one = sparse.eye_array(count), sparse.eye_array(links)
+    change = steps - sparse.eye_array(count, k=-1)
+    # Rounded down: nobody is later at a queue than they could be.
+    lag = (network.free_time_s / step_s).astype(int)
+    late = [sparse.eye_array(count, k=-int(steps_late)) for steps_late in lag]
+    row = [sparse.csr_array(np.eye(links)[:, [link]] @ np.eye(links)[[link]]) for link in range(links)]
+    at_queue = [sum(sparse.kron(late[z], row[z] @ came) for z in range(links)) for came in (onward, entry)]
+    flow = network.saturation_flow_veh_s * step_s
+    served = np.array([[network.serves[s][network.turn_link == z].any() for s in range(stages)] for z in range(links)])
+    junction = np.eye(len(network.junctions))[:, network.stage_junction]
+    # Variables in steps: left (Z), entered (sources), green share (S), on links (Z), queued (Z), outside (sources).
+    outside, nothing = sparse.eye_array(len(sources)), sparse.csr_array((count * links, count * stages))
+    equal = sparse.block_array(
+        [
+            [
+                sparse.kron(steps, one - onward),
+                -sparse.kron(steps, entry),
+                nothing,
+                sparse.kron(change, one),
+                None,
+                None,
+            ],
+            [sparse.kron(steps, one) - at_queue[0], -at_queue[1], None, None, sparse.kron(change, one), None],
+            [None, sparse.kron(steps, outside), None, None, None, sparse.kron(change, outside)],
+        ]
+    )
+    width = [links, len(sources), stages, links, links, len(sources)]
+    begin = count * np.cumsum([0, *width])
+    most = sparse.block_array(
+        [
+            [sparse.kron(steps, one), sparse.csr_array((count * links, begin[2] - begin[1])),
+             -sparse.kron(steps, flow[:, None] * served), sparse.csr_array((count * links, begin[6] - begin[3]))],
+            [None, None, sparse.kron(steps, junction), None],
+        ]
+    )  # fmt: skip
+    cost = np.zeros(begin[6])
+    cost[begin[4] :] = step_s / 3600
+    upper = np.full(begin[6], np.inf)
+    upper[begin[3] : begin[4]] = np.tile(network.storage_veh, count)
+    found = linprog(
+        cost,
+        A_ub=most,
+        b_ub=np.concatenate([np.zeros(count * links), np.full(count * len(network.junctions), 1 - lost)]),
+        A_eq=equal,
+        b_eq=np.concatenate([np.zeros(2 * count * links), arriving.ravel()]),
+        bounds=np.column_stack([np.zeros(begin[6]), upper]),
+        method="highs",
+    )
+    if found.status != 0:
+        raise UtnError(f"there is no bound: {found.message}")
+    return float(found.fun)
