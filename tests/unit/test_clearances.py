@@ -12,7 +12,7 @@ from tests.unit.views import scene
 from utn_sumo import clearances, monitor
 from utn_sumo.clearances import Times, between
 from utn_sumo.contract import Junction, Network
-from utn_sumo.plant.heads import MOST_PATIENCE_S, Heads
+from utn_sumo.plant.heads import LONGEST_RED_S, LOOK_S, MOST_PATIENCE_S, Heads
 
 
 def ways(network: Network, junction: Junction) -> dict[tuple[int, int], clearances.Phases]:
@@ -85,3 +85,15 @@ def test_who_waits_too_long_comes_next_and_who_does_not_wait_does_not(utn17: Net
             if time_s < MOST_PATIENCE_S - 1:
                 assert (kept == now.stage).all()
         assert (kept != now.stage).all() == forced
+
+
+def test_where_green_and_clearance_are_long_who_waits_comes_sooner(utn17: Network) -> None:
+    junction = utn17.junctions[0]
+    stages = [replace(stage, least_green_s=45.0) if stage.junction == 0 else stage for stage in utn17.stages]
+    heads = Heads(replace(utn17, stages=tuple(stages)), lambda index, state: None)
+    sooner_s = LONGEST_RED_S - LOOK_S - 45.0 - utn17.stages[junction.stages[0]].clearance_s
+    for time_s in np.arange(0, sooner_s + LOOK_S, LOOK_S):
+        now = scene(utn17, float(time_s), veh=1.0)
+        kept = heads.patient(now.stage, now)
+        assert (kept != now.stage)[0] == (time_s >= sooner_s)
+        assert (kept == now.stage)[1:].all()

@@ -14,6 +14,8 @@ from utn_sumo.contract import Bools, Floats, Ints, Network, Stage, View
 
 MOST_PATIENCE_S = 150.0
 """A stage that somebody has waited for so long comes next, whatever is wished."""
+LONGEST_RED_S = 180.0
+"""Where least greens and clearances are long it comes next sooner: nobody is to wait longer than this."""
 LOOK_S = 5.0
 """Time between two looks at who waits."""
 
@@ -33,6 +35,7 @@ class Heads:
         """(J,) when it has had its least green."""
         self._ways: dict[tuple[int, int], Phases] = {}
         self._times = [Times.of(network, junction) for junction in network.junctions]
+        self._patience_s = _patience_s(network)
         self._called_s = np.zeros(len(network.stages))
         """(S,) since when somebody has been waiting for each stage."""
         self._look_s = 0.0
@@ -75,10 +78,8 @@ class Heads:
             called = self._walked | (self._served @ view.waiting_veh > 0)
             called[view.stage] = False
             self._called_s[~called] = view.time_s
-            self._overdue = []
-            if self._called_s.min() <= view.time_s - MOST_PATIENCE_S:
-                late = np.flatnonzero(self._called_s <= view.time_s - MOST_PATIENCE_S)
-                self._overdue = sorted(late.tolist(), key=lambda stage: -self._called_s[stage])
+            late = np.flatnonzero(self._called_s + self._patience_s <= view.time_s)
+            self._overdue = sorted(late.tolist(), key=lambda stage: -self._called_s[stage])
             self._look_s = view.time_s + LOOK_S
         if not self._overdue:
             return wish
@@ -102,6 +103,16 @@ class Heads:
         self._ready_s[index] = at_s + self.network.stages[stage].least_green_s
         self.next_s = now_s
         self.advance(now_s)
+
+
+def _patience_s(network: Network) -> Floats:
+    """(S,) how long somebody may wait for each stage until it comes next.
+
+    What is shown then may have begun just before, and there is time between two looks.
+    """
+    until_next_s = network.least_green_s + network.clearance_s
+    longest_s = np.array([max(until_next_s[list(junction.stages)]) for junction in network.junctions])
+    return np.minimum(MOST_PATIENCE_S, LONGEST_RED_S - LOOK_S - longest_s)[network.stage_junction]
 
 
 def _turn_groups(network: Network) -> Floats:
