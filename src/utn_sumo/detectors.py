@@ -174,11 +174,11 @@ def write(network: Network, path: Path, period_s: float, *, zones: bool = False)
                 loop(_named(kind, f"{edge}_{lane}"), f"{edge}_{lane}", position_m)
         for kind, edge, from_m, to_m in _areas(network, link, zones=zones):
             areas(kind, edge, from_m, to_m)
-    turning = {via for turn in network.turns for via in turn.via_lanes}
+    turning = [via for turn in network.turns for via in turn.via_lanes]
     # One link's traffic may part onto another's: one loop then counts for both.
-    beside = {via for link in network.links for via in (*link.joining, *link.parting)}
+    beside = sorted({via for link in network.links for via in (*link.joining, *link.parting)})
     for kind, lanes in (("turn", turning), ("side", beside)):
-        for via in sorted(lanes):
+        for via in lanes:
             loop(_named(kind, via), via, TURN_M)
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
