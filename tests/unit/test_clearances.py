@@ -91,7 +91,8 @@ def test_where_green_and_clearance_are_long_who_waits_comes_sooner(utn17: Networ
     junction = utn17.junctions[0]
     stages = [replace(stage, least_green_s=45.0) if stage.junction == 0 else stage for stage in utn17.stages]
     heads = Heads(replace(utn17, stages=tuple(stages)), lambda index, state: None)
-    sooner_s = LONGEST_RED_S - LOOK_S - 45.0 - utn17.stages[junction.stages[0]].clearance_s
+    # The two others may have to be shown before.
+    sooner_s = LONGEST_RED_S - LOOK_S - 2 * (45.0 + utn17.stages[junction.stages[0]].clearance_s)
     for time_s in np.arange(0, sooner_s + LOOK_S, LOOK_S):
         now = scene(utn17, float(time_s), veh=1.0)
         kept = heads.patient(now.stage, now)

@@ -108,11 +108,11 @@ class Heads:
 def _patience_s(network: Network) -> Floats:
     """(S,) how long somebody may wait for each stage until it comes next.
 
-    What is shown then may have begun just before, and there is time between two looks.
+    All others of its junction may have to be shown before, and there is time between two looks.
     """
     until_next_s = network.least_green_s + network.clearance_s
-    longest_s = np.array([max(until_next_s[list(junction.stages)]) for junction in network.junctions])
-    return np.minimum(MOST_PATIENCE_S, LONGEST_RED_S - LOOK_S - longest_s)[network.stage_junction]
+    others_s = np.bincount(network.stage_junction, until_next_s)[network.stage_junction] - until_next_s
+    return np.asarray(np.clip(LONGEST_RED_S - LOOK_S - others_s, LOOK_S, MOST_PATIENCE_S))
 
 
 def _turn_groups(network: Network) -> Floats:
