@@ -1,9 +1,10 @@
 """A bound below every controller's delay: traffic as a fluid, the future known, green shared out without a cycle.
 
 A linear programme over the whole run. Nobody waits at a red that the junction has time to spare for, nobody loses time
-by starting or braking, storage is kept, and links discharge at the saturation flows that were calibrated. All that is
-charged is a share of the time that goes to clearances. What is left is delay that no control can take away: more
-vehicles than the junctions can serve.
+by starting or braking, storage is kept, and links discharge at the network's saturation flows all the time. All that
+is charged is a share of the time that goes to clearances. What is left is delay that no control can take away: more
+vehicles than the junctions can serve. It is below the mean over runs whose demand is drawn about the one given, since
+the least delay is convex in the demand; a single run may have drawn less.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from utn_sumo.errors import UtnError
 def least_delay_veh_h(network: Network, demand_veh_h: Floats, hours: float, *, step_s: float, lost: float) -> float:
     """Delay [veh h] that is not to be gone below in a run of so many hours.
 
-    `demand_veh_h` (steps, Z) at the sources, the steps of equal length; `step_s` that of the programme's own steps,
-    `lost` share of each junction's time in which nobody has green. Its turning fractions are the network's.
+    `demand_veh_h` (steps, Z) at the sources, the steps of equal length, which the programme's own steps of `step_s`
+    divide; `lost` share of each junction's time in which nobody has green. Its turning fractions are the network's.
     """
     count, links, stages = round(hours * 3600 / step_s), len(network.links), len(network.stages)
     sources = np.flatnonzero(network.is_source)

@@ -303,6 +303,28 @@ class Network:
         """(Z,) by how much a queued vehicle shortens the way to the queue's tail, in time."""
         return np.array([link.queue_spacing_m / link.free_speed_m_s for link in self.links])
 
+    def watched(self, link: Link) -> list[tuple[str, float]]:
+        """(edge, metres of it seen) from the stop line upstream, as far as the lane-area detectors reach."""
+        seen, rest = [], AREA_REACH_M
+        for edge in reversed(link.edges):
+            if rest <= 0:
+                break
+            metres = min(rest, self.edge_length_m[edge])
+            seen.append((edge, metres))
+            rest -= metres
+        return seen
+
+    @cached_property
+    def watched_lane_m(self) -> tuple[Floats, Floats]:
+        """Lane metres that the lane-area detectors see: (G,) by lane group, (Z,) of each link before its lanes part."""
+        seen_m = [dict(self.watched(link)) for link in self.links]
+        groups = [len(group.lanes) * seen_m[group.link][self.links[group.link].edges[-1]] for group in self.groups]
+        before = [
+            sum(metres * len(self.edge_lanes[edge]) for edge, metres in seen.items() if edge != link.edges[-1])
+            for seen, link in zip(seen_m, self.links, strict=True)
+        ]
+        return np.array(groups), np.array(before, dtype=float)
+
     @cached_property
     def clearance_s(self) -> Floats:
         """(S,) clearance after each stage."""
@@ -596,11 +618,6 @@ class View(Protocol):
         ...
 
     @property
-    def zone_veh(self) -> Floats:
-        """(G, zones) vehicles by lane group and by how far they are from the stop line (`ZONES_M`)."""
-        ...
-
-    @property
     def x_veh(self) -> Floats:
         """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
         ...
@@ -613,6 +630,13 @@ class View(Protocol):
     @property
     def left_veh(self) -> Floats:
         """(Z,) vehicles that have left each link since the run began, but for who ends on it."""
+        ...
+
+    def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
+        """Vehicles before some junctions (J,) by how far they are from the stop line (`ZONES_M`), none elsewhere.
+
+        (G, zones) on the lanes of each lane group, (Z, zones) on each link before its lanes part.
+        """
         ...
 
     def near_one_veh(self, group: int) -> float:

@@ -19,7 +19,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from utn_sumo.contract import AREA_REACH_M, ZONES_M, Floats, LaneGroup, Link, Measurement, Network
+from utn_sumo.contract import ZONES_M, Floats, LaneGroup, Link, Measurement, Network
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -88,12 +88,12 @@ def ids(network: Network) -> DetectorIds:
         stop_line=tuple(on("stop", link.edges[-1]) for link in network.links),
         turn=tuple(tuple(_named("turn", lane) for lane in turn.via_lanes) for turn in network.turns),
         area=tuple(
-            tuple(name for edge, _ in _watched(network, link) for name in on("area", edge)) for link in network.links
+            tuple(name for edge, _ in network.watched(link) for name in on("area", edge)) for link in network.links
         ),
         group=tuple(of_group("area", group) for group in network.groups),
         group_stop_line=tuple(of_group("stop", group) for group in network.groups),
         upstream=tuple(
-            tuple(name for edge, _ in _watched(network, link) if edge != link.edges[-1] for name in on("area", edge))
+            tuple(name for edge, _ in network.watched(link) if edge != link.edges[-1] for name in on("area", edge))
             for link in network.links
         ),
         joining=tuple(tuple(_named("side", lane) for lane in link.joining) for link in network.links),
@@ -108,33 +108,10 @@ def _named(kind: str, lane: str) -> str:
     return f"utn_{kind}_{lane}"
 
 
-def watched_lane_m(network: Network) -> tuple[Floats, Floats]:
-    """Lane metres that the lane-area detectors see: (G,) by lane group, (Z,) of each link before its lanes part."""
-    seen_m = [dict(_watched(network, link)) for link in network.links]
-    groups = [len(group.lanes) * seen_m[group.link][network.links[group.link].edges[-1]] for group in network.groups]
-    before = [
-        sum(metres * len(network.edge_lanes[edge]) for edge, metres in seen.items() if edge != link.edges[-1])
-        for seen, link in zip(seen_m, network.links, strict=True)
-    ]
-    return np.array(groups), np.array(before, dtype=float)
-
-
-def _watched(network: Network, link: Link) -> list[tuple[str, float]]:
-    """(edge, metres of it seen) from the stop line upstream, as far as the lane-area detectors reach."""
-    watched, rest = [], AREA_REACH_M
-    for edge in reversed(link.edges):
-        if rest <= 0:
-            break
-        seen = min(rest, network.edge_length_m[edge])
-        watched.append((edge, seen))
-        rest -= seen
-    return watched
-
-
 def _zones(network: Network, link: Link) -> list[tuple[str, int, float, float]]:
     """(edge, zone, metres from the edge's begin, to) of each piece of a zone on an edge."""
     pieces, to_stop_m = [], 0.0
-    for edge, seen_m in _watched(network, link):
+    for edge, seen_m in network.watched(link):
         near_m = 0.0
         for zone, far_m in enumerate(ZONES_M):
             low_m, high_m = max(near_m, to_stop_m), min(far_m, to_stop_m + seen_m)
@@ -148,7 +125,7 @@ def _zones(network: Network, link: Link) -> list[tuple[str, int, float, float]]:
 
 def _areas(network: Network, link: Link, *, zones: bool) -> Iterator[tuple[str, str, float, float]]:
     """(kind, edge, metres from its begin, to) of the lane-area detectors on each of its lanes."""
-    for edge, seen_m in _watched(network, link):
+    for edge, seen_m in network.watched(link):
         length_m = network.edge_length_m[edge]
         yield "area", edge, length_m - seen_m, length_m
     for edge, zone, from_m, to_m in _zones(network, link) if zones else ():

@@ -14,7 +14,6 @@ from __future__ import annotations
 import numpy as np
 
 from utn_sumo.contract import AREA_REACH_M, Floats, Measurement, Network, State
-from utn_sumo.detectors import watched_lane_m
 from utn_sumo.model import share_on_the_way
 
 FULL_SHARE = 0.8
@@ -77,7 +76,7 @@ class Estimator:
         length_m = np.array([link.length_m for link in network.links])
         speed_m_s = np.array([link.free_speed_m_s for link in known.links])
         self._watched_veh = network.watched_veh
-        group_m, before_m = watched_lane_m(network)
+        group_m, before_m = network.watched_lane_m
         lane_m = before_m + np.bincount(network.group_link, group_m, links)
         self._group_veh = np.maximum(self._watched_veh[network.group_link] * group_m / lane_m[network.group_link], 1.0)
         """(G,) vehicles that the part of each lane group in view holds."""

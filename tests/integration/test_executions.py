@@ -170,6 +170,17 @@ class Counting:
         return read
 
 
+def test_zones_are_read_before_those_junctions_that_are_asked_for_and_no_others(utn17: Network) -> None:
+    sumo = Counting()
+    eyes, names = Eyes(utn17, ids(utn17), sumo), ids(utn17).group_zone
+    own = utn17.link_junction[utn17.group_link]
+    for junction in range(len(utn17.junctions)):
+        sumo.asked.clear()
+        eyes.zone_veh(np.arange(len(utn17.junctions)) == junction)
+        expected = sum(len(lane) for group in np.flatnonzero(own == junction) for lane in names[group])
+        assert sumo.asked == {"getLastStepVehicleNumber": expected}
+
+
 def test_what_nobody_asks_for_is_not_read_and_nothing_is_read_twice(utn17: Network) -> None:
     sumo = Counting()
     eyes, heads = Eyes(utn17, ids(utn17), sumo), Heads(utn17, lambda index, state: None)
@@ -195,6 +206,7 @@ class Sees:
         pass
     def wish(self, view):
         off, all_veh = 0.0, 0
+        zone_veh, _ = view.zone_veh(np.ones(len(self.network.junctions), dtype=bool))
         for group, lanes in enumerate(self.network.groups):
             edge = self.network.links[lanes.link].edges[-1]
             away_m = [
@@ -202,7 +214,7 @@ class Sees:
                 for lane in lanes.lanes for vehicle in libsumo.lane.getLastStepVehicleIDs(f"{edge}_{lane}")
             ]
             true = np.histogram(away_m, [0.0, *ZONES_M])[0]
-            off, all_veh = off + abs(true - view.zone_veh[group]).sum(), all_veh + true.sum()
+            off, all_veh = off + abs(true - zone_veh[group]).sum(), all_veh + true.sum()
         with open(self.path, "a", encoding="utf-8") as file:
             print(off, all_veh, file=file)
         return np.array([j.stages[int(view.time_s // 30) % len(j.stages)] for j in self.network.junctions])

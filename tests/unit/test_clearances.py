@@ -87,6 +87,20 @@ def test_who_waits_too_long_comes_next_and_who_does_not_wait_does_not(utn17: Net
         assert (kept != now.stage).all() == forced
 
 
+def test_who_has_had_green_in_one_stage_does_not_call_for_another(utn17: Network) -> None:
+    first, second, last = utn17.junctions[0].stages
+    both = replace(utn17.stages[last], turns=(*utn17.stages[last].turns, *utn17.stages[second].turns))
+    stages = tuple(both if index == last else stage for index, stage in enumerate(utn17.stages))
+    net = replace(utn17, stages=stages)
+    heads, present = Heads(net, lambda index, state: None), scene(net).stage
+    for time_s in np.arange(0, 400.0, LOOK_S):
+        # The last stage, which serves the second's traffic too, has been shown meanwhile.
+        present[0] = last if time_s == 100 else first
+        now = scene(net, float(time_s), present, veh=1.0)
+        kept = heads.patient(now.stage, now)[0]
+        assert (kept == last) == (time_s == 100 or time_s >= 100 + MOST_PATIENCE_S)
+
+
 def test_where_green_and_clearance_are_long_who_waits_comes_sooner(utn17: Network) -> None:
     junction = utn17.junctions[0]
     stages = [replace(stage, least_green_s=45.0) if stage.junction == 0 else stage for stage in utn17.stages]

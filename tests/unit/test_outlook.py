@@ -22,6 +22,11 @@ A_BIN = 1.0
 """When in a bin somebody came is not known."""
 
 
+def looked(outlook: Outlook, view: Scene) -> tuple[Floats, Floats]:
+    """(N,) who stands and (N, K) who comes."""
+    return outlook.look(view, view.zone_veh(view.free))[:2]
+
+
 class Road:
     """One link of a network on which vehicles enter at known times, drive freely, and leave or stand at its end."""
 
@@ -43,7 +48,7 @@ class Road:
     def look(self) -> tuple[Floats, Floats]:
         """(N,) and (N, K), a bin later."""
         self.now_s += BIN_S
-        return self.outlook.look(self._view())
+        return looked(self.outlook, self._view())
 
     def _since(self, after_s: float) -> int:
         return int((self.entered_s + after_s <= self.now_s).sum())
@@ -64,7 +69,7 @@ class Road:
         one[self.link] = 1.0
         return replace(
             scene(self.network, self.now_s),
-            zone_veh=np.outer(self.group_share, self._zone_veh()),
+            group_zone_veh=np.outer(self.group_share, self._zone_veh()),
             x_veh=self.on_it() * one,
             entered_veh=self._since(0.0) * one,
         )
@@ -131,9 +136,9 @@ def test_who_is_by_the_line_stands_by_lane_group_as_seen(utn17: Network) -> None
     outlook = Outlook(utn17, streams, BINS, BIN_S)
     near_veh = np.arange(len(utn17.groups), dtype=float)
     seen_veh = np.bincount(utn17.group_link, near_veh, len(utn17.links))
-    still = replace(scene(utn17), zone_veh=by_the_line(near_veh), x_veh=seen_veh, entered_veh=seen_veh)
+    still = replace(scene(utn17), group_zone_veh=by_the_line(near_veh), x_veh=seen_veh, entered_veh=seen_veh)
     for _ in range(30):
-        stand, come = outlook.look(still)
+        stand, come = looked(outlook, still)
     assert np.bincount(streams.group, stand, len(utn17.groups)) == pytest.approx(near_veh)
     near_bins = int(utn17.free_time_s.min() / BIN_S) - 1
     assert come[:, :near_bins].sum() == pytest.approx(0.0)
@@ -148,9 +153,9 @@ def test_a_queue_that_reaches_back_out_of_sight_follows_whom_the_detectors_see(u
     one[link] = 1.0
     groups = utn17.group_link == link
     zone_veh = np.outer(groups / groups.sum(), storage_veh * np.diff(ends_m) / road.length_m)
-    full = replace(scene(utn17), zone_veh=zone_veh, x_veh=storage_veh * one, entered_veh=storage_veh * one)
+    full = replace(scene(utn17), group_zone_veh=zone_veh, x_veh=storage_veh * one, entered_veh=storage_veh * one)
     for _ in range(30):
-        stand, come = outlook.look(full)
+        stand, come = looked(outlook, full)
     seen_bins = int(AREA_REACH_M / road.free_speed_m_s / BIN_S) + 1
     assert stand.sum() + come[:, :seen_bins].sum() == pytest.approx(storage_veh, rel=0.01)
     assert stand.sum() == pytest.approx(storage_veh * ZONES_M[0] / road.length_m)
@@ -185,7 +190,7 @@ def test_whom_a_neighbour_sends_arrives_after_the_way_along_the_link(utn17: Netw
         outlook = Outlook(utn17, streams, BINS, BIN_S)
         link, place = streams.next_link[stream], 4
         outlook.sent_veh[stream, place] = 3.0
-        stand, come = outlook.look(scene(utn17))
+        stand, come = looked(outlook, scene(utn17))
         assert not stand.any()
         assert come.sum() == pytest.approx(3.0)
         assert come[streams.link == link].sum() == pytest.approx(3.0)

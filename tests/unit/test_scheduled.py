@@ -478,7 +478,7 @@ def drawn(network: Network, seed: int) -> Scene:
     return replace(
         scene(network, 20.0, np.array([rng.choice(junction.stages) for junction in network.junctions])),
         free=rng.uniform(size=len(network.junctions)) < 0.8,
-        zone_veh=by_the_line(near_veh),
+        group_zone_veh=by_the_line(near_veh),
         x_veh=seen_veh,
         entered_veh=seen_veh,
     )
@@ -521,7 +521,7 @@ class TestExecution:
             execution = Scheduled(utn17, bounds=bounds)
             execution.begin(plan, Estimator(utn17, utn17).initial())
             went_veh = np.ones(len(utn17.links))
-            view = replace(scene(utn17, 500.0), zone_veh=by_the_line(near_veh), left_veh=went_veh)
+            view = replace(scene(utn17, 500.0), group_zone_veh=by_the_line(near_veh), left_veh=went_veh)
             assert (execution.wish(view) != view.stage).all() == leaves
             # It has not been reached yet.
             view = replace(view, time_s=2.0)
@@ -537,8 +537,30 @@ class TestExecution:
             x_veh[ahead] = taken * utn17.storage_veh[ahead]
             near_veh = np.zeros(len(utn17.groups))
             near_veh[streams.group[stream]] = 8.0
-            execution.wish(replace(scene(utn17), zone_veh=by_the_line(near_veh), x_veh=x_veh))
+            execution.wish(replace(scene(utn17), group_zone_veh=by_the_line(near_veh), x_veh=x_veh))
             assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
+
+    @pytest.mark.parametrize("blocking", [0.0, 4.0])
+    @pytest.mark.parametrize("hemmed", ["10", "11"])
+    def test_of_two_queues_alike_the_one_that_others_wait_behind_goes_first(
+        self, hemmed: str, blocking: float, utn17: Network
+    ) -> None:
+        name = [link.id for link in utn17.links]
+        queued = [name.index("10"), name.index("11")]
+        behind = utn17.turn_link[np.isin(utn17.turn_next, name.index(hemmed))]
+        near_veh = np.zeros(len(utn17.groups))
+        near_veh[np.isin(utn17.group_link, [*queued, *behind])] = 45.0
+        junction = utn17.link_junction[name.index(hemmed)]
+        execution, chosen = Scheduled(utn17, blocking=blocking), []
+        for now_s in np.arange(0.0, 300.0, 2.0):
+            went_veh = np.full(len(name), now_s)
+            view = replace(scene(utn17, now_s), group_zone_veh=by_the_line(near_veh), left_veh=went_veh)
+            chosen.append(int(execution.wish(view)[junction]))
+        goes = [name.index(hemmed) in utn17.turn_link[utn17.serves[stage]] for stage in chosen]
+        assert goes[-1] or not blocking
+        # Without it, and as long as it has not lasted, whoever has green already goes on.
+        assert chosen[0] == view.stage[junction]
+        assert blocking or set(chosen) == {view.stage[junction]}
 
     @pytest.mark.parametrize(
         ("goes", "stands", "stays"), [(False, True, False), (True, True, True), (False, False, True)]
@@ -554,7 +576,7 @@ class TestExecution:
         def stay(now_s: float, begin_s: Floats) -> bool:
             left_veh = np.full(len(utn17.links), now_s * goes)
             zone_veh = by_the_line(near_veh)
-            view = replace(scene(utn17, now_s), zone_veh=zone_veh, left_veh=left_veh, begin_s=begin_s)
+            view = replace(scene(utn17, now_s), group_zone_veh=zone_veh, left_veh=left_veh, begin_s=begin_s)
             return bool((execution.wish(view) == view.stage).all())
 
         assert all(stay(now_s, begin_s) for now_s in np.arange(30.0, 38.0, 2.0))
@@ -564,7 +586,8 @@ class TestExecution:
 
     @pytest.mark.parametrize("made", [Scheduled, Recommended])
     @pytest.mark.parametrize(
-        "settings", [{"horizn_s": 50}, {"horizon_s": 5}, {"order": "random"}, {"bounds": 1}, {"full": 0}]
+        "settings",
+        [{"horizn_s": 50}, {"horizon_s": 5}, {"order": "random"}, {"bounds": 1}, {"full": 0}, {"blocking": -1}],
     )
     def test_a_wrong_setting_is_refused(
         self, made: Callable[..., object], settings: dict[str, object], utn17: Network

@@ -19,11 +19,20 @@ class Scene:
     free: Bools
     waiting_veh: Floats
     near_veh: Floats
-    zone_veh: Floats
+    group_zone_veh: Floats
+    link_zone_veh: Floats
     x_veh: Floats
     gap_s: Floats
     entered_veh: Floats
     left_veh: Floats
+    group_junction: Ints
+    link_junction: Ints
+
+    def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
+        return (
+            np.where(junctions[self.group_junction][:, None], self.group_zone_veh, 0.0),
+            np.where(junctions[self.link_junction][:, None], self.link_zone_veh, 0.0),
+        )
 
     def near_one_veh(self, group: int) -> float:
         return float(self.near_veh[group])
@@ -54,8 +63,11 @@ def scene(
         everybody,
         everybody,
         by_the_line(everybody),
+        np.zeros((len(network.links), len(ZONES_M))),
         np.zeros(len(network.links)),
         groups + gap_s,
         np.zeros(len(network.links)),
         np.zeros(len(network.links)),
+        network.link_junction[network.group_link],
+        network.link_junction,
     )

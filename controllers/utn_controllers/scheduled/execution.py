@@ -8,22 +8,16 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import EXIT, ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
+from utn_controllers.scheduled.worth import Worth
+from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
 
 BIN_S = 2
 """Length of a bin, and time between two decisions."""
-FADING = 0.2
-"""Over what share of its storage about `full` a link is fed less and less."""
-LEAST_WORTH = 0.05
-"""Of a vehicle that would go from an empty link into a full one."""
-BLOCKED_VEH = 1e-6
-"""What leaves in a bin where nobody goes, or is to go."""
 
 
 class ScheduledSettings(BaseModel):
@@ -41,6 +35,8 @@ class ScheduledSettings(BaseModel):
     """Over the saturation flow, which is that of long queues with their start: what a queue leaves with."""
     crowding: float = Field(0.4, ge=0, le=20)
     """By how much waiting on a full link costs more than on an empty one, in vehicles."""
+    blocking: float = Field(4.0, ge=0, le=20)
+    """By how much more it costs in a queue that others have to wait behind, one link back, in vehicles."""
     full: float = Field(0.4, gt=0, le=2)
     """Share of its storage about which a link is fed less and less: beyond it some lane is full and stops all."""
     standstill_s: float = Field(8.0, ge=2, le=200)
@@ -59,6 +55,13 @@ class Scheduled:
         self._streams = Streams(network)
         bins = round(self.settings.horizon_s / BIN_S)
         self._outlook = Outlook(network, self._streams, bins, BIN_S)
+        self._worth = Worth(
+            network,
+            self._streams,
+            crowding=self.settings.crowding,
+            blocking=self.settings.blocking,
+            full=self.settings.full,
+        )
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
         moves = Moves(network, self._streams, BIN_S)
@@ -88,18 +91,12 @@ class Scheduled:
 
     def wish(self, view: View | _Nobody) -> Ints:
         """(J,) stage that each junction's schedule begins with."""
-        stand, come = self._outlook.look(view)
-        streams, settings = self._streams, self.settings
-        worth, most = _priced(
-            view.x_veh,
-            self.network.storage_veh,
-            streams.link,
-            streams.next_link,
-            self._most,
-            settings.crowding,
-            settings.full,
-        )
-        most[self._standstill.look(view, stand)] = BLOCKED_VEH
+        zones = view.zone_veh(view.free)
+        outlook = self._outlook
+        stand, come, held = outlook.look(view, zones)
+        stuck = self._standstill.look(view, stand)
+        shares = outlook.of_link, outlook.group_share
+        worth, most = self._worth.look(view.time_s, view.free, zones, view.x_veh, shares, self._most, stuck, held)
         if self._green_s is None:
             rest = self._endless
         else:
@@ -116,7 +113,7 @@ class Scheduled:
                 worth,
                 most,
                 self._plan,
-                self._outlook.sent_veh,
+                outlook.sent_veh,
             )
         )
 
@@ -125,7 +122,7 @@ class Scheduled:
         none = np.zeros(len(self.network.links))
         stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
-        zones = np.zeros((len(self.network.groups), len(ZONES_M)))
+        zones = np.zeros((len(self.network.groups), len(ZONES_M))), np.zeros((len(none), len(ZONES_M)))
         self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, none))
 
     def _take_up(self) -> None:
@@ -142,22 +139,6 @@ class Scheduled:
         return follows
 
 
-@compiled
-def _priced(
-    x: Floats, storage: Floats, links: Ints, next_links: Ints, most: Floats, crowding: float, full: float
-) -> tuple[Floats, Floats]:
-    """(N,) what a vehicle of each stream is worth, and (N,) how many leave in a bin of green."""
-    worth, moving = np.empty(len(links)), most.copy()
-    for stream, ahead in enumerate(next_links):
-        taken = x[ahead] / storage[ahead] if ahead != EXIT else 0.0
-        own = x[links[stream]] / storage[links[stream]]
-        worth[stream] = max(1 + crowding * (own - taken), LEAST_WORTH)
-        fed = (full + FADING / 2 - taken) / FADING
-        if fed < 1:
-            moving[stream] = max(fed * most[stream], BLOCKED_VEH)
-    return worth, moving
-
-
 @dataclass(frozen=True)
 class _Nobody:
     """What is seen of empty roads: of a view what `wish` looks at."""
@@ -166,7 +147,10 @@ class _Nobody:
     stage: Ints
     begin_s: Floats
     free: Bools
-    zone_veh: Floats
+    zones: tuple[Floats, Floats]
     x_veh: Floats
     entered_veh: Floats
     left_veh: Floats
+
+    def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:  # noqa: ARG002 - nobody is anywhere
+        return self.zones

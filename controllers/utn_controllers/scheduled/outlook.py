@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from utn_controllers.compiling import compiled
+from utn_controllers.scheduled.pockets import held_up, rooms_veh
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
 
@@ -19,8 +20,6 @@ class Seen(Protocol):
 
     @property
     def free(self) -> Bools: ...
-    @property
-    def zone_veh(self) -> Floats: ...
     @property
     def x_veh(self) -> Floats: ...
     @property
@@ -57,22 +56,25 @@ class Outlook:
         """Vehicles a bin that come onto each link of late, and of these those that schedules said."""
         self.sent_veh = np.zeros((len(streams.link), bins))
         """(N, K) vehicles that each stream's schedule sends off in each bin, from the one that it was made in on."""
+        self._room = rooms_veh(network)
         self.take_up(network.fraction)
 
     def take_up(self, fraction: Floats) -> None:
         """Go by these turning fractions (M,) from now on."""
         self.of_link, self.of_group = self.streams.shares(fraction)
+        self.group_share = self.network.group_shares(fraction)
 
-    def look(self, view: Seen) -> tuple[Floats, Floats]:
+    def look(self, view: Seen, zones: tuple[Floats, Floats]) -> tuple[Floats, Floats, Floats]:
         """(N,) vehicles by the stop line, (N, K) those that could be in each bin. A bin has gone by since.
 
-        Before junctions that are not free, who decide nothing now, there are none.
+        By the vehicles in `zones` (View.zone_veh) before junctions that are free: before others, who decide nothing
+        now, there are none. And (G,) by how much more those weigh who hold others up.
         """
         self._now = (self._now + 1) % len(self._came)
         streams, network = self.streams, self.network
-        stand, come = _look(
+        stand, come, held = _look(
             view.free,
-            view.zone_veh,
+            *zones,
             view.x_veh,
             view.entered_veh,
             self._before_veh,
@@ -83,6 +85,7 @@ class Outlook:
             self._arrival,
             self._due_s,
             self._sight_s,
+            *self._room,
             network.link_junction,
             network.group_link,
             streams.link,
@@ -90,9 +93,10 @@ class Outlook:
             streams.next_link,
             self.of_link,
             self.of_group,
+            self.group_share,
             self.bin_s,
         )
-        return stand, come
+        return stand, come, held
 
 
 def _arrival(reach: Floats, bins: int) -> Floats:
@@ -109,6 +113,7 @@ def _arrival(reach: Floats, bins: int) -> Floats:
 def _look(
     free: Bools,
     zone: Floats,
+    upstream: Floats,
     x: Floats,
     entered: Floats,
     before: Floats,
@@ -119,6 +124,8 @@ def _look(
     arrival: Floats,
     due_s: Floats,
     sight_s: Floats,
+    room: Floats,
+    upstream_room: Floats,
     junction: Ints,
     group_link: Ints,
     stream_link: Ints,
@@ -126,11 +133,12 @@ def _look(
     next_link: Ints,
     of_link: Floats,
     of_group: Floats,
+    share: Floats,
     bin_s: float,
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     links, bins = len(x), sent.shape[1]
     asked = free[junction]
-    far = x.copy()
+    far = x - upstream.sum(axis=1)
     for group in range(len(zone)):
         far[group_link[group]] -= zone[group].sum()
     coming = np.zeros((links, bins))
@@ -140,19 +148,22 @@ def _look(
         if asked[link] and due_s[link] > sight_s[link]:
             _arrive(came[:, link], now, max(far[link], 0.0), sight_s[link], due_s[link], coming[link], bin_s)
     _send(asked, sent, next_link, came[now], rate, due_s, coming, bin_s)
+    shut, held = held_up(zone, upstream, x, share, room, upstream_room, group_link)
     stand, come = np.zeros(len(stream_link)), np.zeros((len(stream_link), bins))
     for stream in range(len(stream_link)):
         group, link = stream_group[stream], stream_link[stream]
         if not asked[link]:
             continue
-        stand[stream] = of_group[stream] * zone[group, 0]
+        of_upstream = 0.0 if shut[group] else of_link[stream]
+        stand[stream] = of_group[stream] * zone[group, 0] + of_upstream * upstream[link, 0]
         for place in range(bins):
-            come[stream, place] = of_link[stream] * coming[link, place]
+            come[stream, place] = of_upstream * coming[link, place]
         for part in range(1, zone.shape[1]):
-            if zone[group, part] > 0:
+            veh = of_group[stream] * zone[group, part] + of_upstream * upstream[link, part]
+            if veh > 0:
                 for place in range(bins):
-                    come[stream, place] += of_group[stream] * zone[group, part] * arrival[link, part, place]
-    return stand, come
+                    come[stream, place] += veh * arrival[link, part, place]
+    return stand, come, held
 
 
 @compiled
@@ -196,7 +207,7 @@ def _send(
             rate[1, link] += fresh * sent[stream, 0]
             if not asked[link]:
                 continue
-            # A bin of what it has planned has gone by.
+            # A bin of what it has planned has gone by; who left in it is mostly amid the junction, not yet counted.
             delay = int(due_s[link] / bin_s + 0.5) - 1
             for place in range(max(delay, 0), bins):
                 coming[link, place] += sent[stream, place - delay]

@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
@@ -40,18 +41,52 @@ class Standstill:
         self._junction = network.link_junction
         self._row = np.argsort(streams.stage)
         """(S,) row of each of the network's stages in `streams.serves`."""
-        self._stream = np.arange(len(streams.link))
-        self._stream_junction = network.link_junction[streams.link]
         self._went_s = np.zeros(len(network.links))
         self._left_veh = np.zeros(len(network.links))
 
     def look(self, view: Shown, stand: Floats) -> Bools:
         """(N,) streams that stand before green on a link from which nobody goes; `stand` (N,) vehicles."""
-        streams = self._streams
-        green = streams.serves[self._row[view.stage][self._stream_junction], self._stream]
-        waiting_veh = np.bincount(streams.link, green * stand, len(self._went_s))
-        goes = (view.left_veh > self._left_veh) | (waiting_veh < WAITING_VEH)
-        self._left_veh = view.left_veh
-        self._went_s[goes] = view.time_s
-        since_s = np.maximum(self._went_s, view.begin_s[self._junction])
-        return np.asarray(green & (view.time_s - since_s >= self._after_s)[streams.link])
+        return np.asarray(
+            _look(
+                view.time_s,
+                self._row[view.stage],
+                view.begin_s,
+                view.left_veh,
+                stand,
+                self._streams.serves,
+                self._streams.link,
+                self._junction,
+                self._left_veh,
+                self._went_s,
+                self._after_s,
+            )
+        )
+
+
+@compiled
+def _look(
+    time_s: float,
+    row: Ints,
+    begin_s: Floats,
+    left: Floats,
+    stand: Floats,
+    serves: Bools,
+    stream_link: Ints,
+    junction: Ints,
+    before: Floats,
+    went_s: Floats,
+    after_s: float,
+) -> Bools:
+    waiting, stuck = np.zeros(len(left)), np.zeros(len(stand), np.bool_)
+    for stream, link in enumerate(stream_link):
+        if serves[row[junction[link]], stream]:
+            waiting[link] += stand[stream]
+    for link in range(len(left)):
+        if left[link] > before[link] or waiting[link] < WAITING_VEH:
+            went_s[link] = time_s
+        before[link] = left[link]
+    for stream, link in enumerate(stream_link):
+        own = junction[link]
+        if serves[row[own], stream]:
+            stuck[stream] = time_s - max(went_s[link], begin_s[own]) >= after_s
+    return stuck

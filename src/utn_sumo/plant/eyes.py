@@ -24,71 +24,63 @@ class Eyes:
         self._group_link = network.group_link
         self._share = network.group_shares(network.fraction)
         """(G,) of a link's traffic what takes the lanes of each group."""
-        self._areas, self._area_group = _flat(ids.group)
-        self._before, self._before_link = _flat(ids.upstream)
-        self._all_areas = [*self._areas, *self._before]
-        self._zones, self._zone_place = _flat(list(chain.from_iterable(ids.group_zone)))
-        """Detectors of zones, and the place of each in (G, zones) that is made flat."""
-        self._before_zones, self._before_zone_place = _flat(list(chain.from_iterable(ids.upstream_zone)))
-        self._entries, self._entry_link = _flat([(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)])
+        # Detectors of a lane group, then of a link before its lanes part.
+        junction = np.concatenate([network.link_junction[network.group_link], network.link_junction])
+        self._is_shared = any(ids.upstream)
+        self._areas = _Detectors([*ids.group, *ids.upstream], junction)
+        self._zones = _Detectors(
+            list(chain.from_iterable([*ids.group_zone, *ids.upstream_zone])), np.repeat(junction, len(ZONES_M))
+        )
+        self._entries = _Detectors(
+            [(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)], network.link_junction
+        )
         turn_exits = [
             [name for turn in np.flatnonzero(network.turn_link == link) for name in ids.turn[turn]]
             for link in range(self._links)
         ]
-        self._exits, self._exit_link = _flat([(*a, *b) for a, b in zip(turn_exits, ids.parting, strict=True)])
+        self._exits = _Detectors(
+            [(*a, *b) for a, b in zip(turn_exits, ids.parting, strict=True)], network.link_junction
+        )
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
         self._step_s = network.control_step_s
-        self._halting = sumo.lanearea.getLastStepHaltingNumber
-        self._present = sumo.lanearea.getLastStepVehicleNumber
-        self._counted = sumo.inductionloop.getIntervalVehicleNumber
-        self._counted_last = sumo.inductionloop.getLastIntervalVehicleNumber
-        self._since_s = sumo.inductionloop.getTimeSinceDetection
+        self._halting = _bare(sumo, "lanearea", "getLastStepHaltingNumber")
+        self._present = _bare(sumo, "lanearea", "getLastStepVehicleNumber")
+        self._counted = _bare(sumo, "inductionloop", "getIntervalVehicleNumber")
+        self._counted_last = _bare(sumo, "inductionloop", "getLastIntervalVehicleNumber")
+        self._since_s = _bare(sumo, "inductionloop", "getTimeSinceDetection")
         self._x_veh = np.zeros(self._links)
         """(Z,) vehicles on each link when the control step began."""
         self._entered_veh = np.zeros(self._links)
         self._left_veh = np.zeros(self._links)
         """(Z,) vehicles that had come onto each link by then, and that had left it."""
-        self._seen_s = -np.inf
-        self._seen_veh: list[int] = []
-        """When the lane-area detectors were last looked at for who is there, and what each of them showed."""
 
     def begin(self, time_s: float, x_veh: Floats) -> None:
         """A control step begins, with so many vehicles on each link (Z,)."""
         self._x_veh = x_veh
         if time_s > 0:
-            self._entered_veh = self._entered_veh + self._by_link(self._counted_last, self._entries, self._entry_link)
-            self._left_veh = self._left_veh + self._by_link(self._counted_last, self._exits, self._exit_link)
+            self._entered_veh = self._entered_veh + self._entries.read(self._counted_last)
+            self._left_veh = self._left_veh + self._exits.read(self._counted_last)
 
-    def waiting_veh(self, time_s: float) -> Floats:
+    def waiting_veh(self) -> Floats:
         """(G,) standing in the lane-area detectors."""
-        if time_s != self._seen_s:
-            return self._by_group(list(map(self._halting, self._all_areas)))
-        # Nobody stands where nobody is.
-        seen = zip(self._all_areas, self._seen_veh, strict=True)
-        return self._by_group([veh and self._halting(name) for name, veh in seen])
+        return self._by_group(self._areas.read(self._halting))
 
-    def near_veh(self, time_s: float) -> Floats:
+    def near_veh(self) -> Floats:
         """(G,) in the lane-area detectors, moving or not."""
-        self._seen_veh = list(map(self._present, self._all_areas))
-        self._seen_s = time_s
-        return self._by_group(self._seen_veh)
+        return self._by_group(self._areas.read(self._present))
 
-    def zone_veh(self) -> Floats:
-        """(G, zones) vehicles by how far they are from the stop line; who is before the lanes part is shared out."""
-        own = self._by_zone(self._zones, self._zone_place, self._groups)
-        if not self._before_zones:
-            return own
-        before = self._by_zone(self._before_zones, self._before_zone_place, self._links)
-        return np.asarray(own + before[self._group_link] * self._share[:, None])
+    def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
+        """(G, zones) and (Z, zones) of contract.View."""
+        veh = self._zones.read(self._present, junctions).reshape(-1, len(ZONES_M))
+        return veh[: self._groups], veh[self._groups :]
 
     def crossed_veh(self, time_s: float) -> tuple[Floats, Floats]:
         """(Z,) that have come onto each link since the control step began, and (Z,) that have left it."""
         if time_s % self._step_s == 0:
             return np.zeros(self._links), np.zeros(self._links)
-        entered = self._by_link(self._counted, self._entries, self._entry_link)
-        return entered, self._by_link(self._counted, self._exits, self._exit_link)
+        return self._entries.read(self._counted), self._exits.read(self._counted)
 
     def total_veh(self, crossed_veh: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
         """The same since the run began."""
@@ -108,21 +100,39 @@ class Eyes:
         """Since a vehicle was last on the stop-line loops of one lane group."""
         return float(min(map(self._since_s, self._group_stop_line[group])))
 
-    def _by_link(self, getter: Any, names: Sequence[str], link: Ints) -> Floats:
-        return np.asarray(np.bincount(link, list(map(getter, names)), self._links), dtype=float)
-
-    def _by_zone(self, names: Sequence[str], place: Ints, rows: int) -> Floats:
-        """(rows, zones) vehicles that the detectors of zones count."""
-        veh = np.bincount(place, list(map(self._present, names)), rows * len(ZONES_M))
-        return np.asarray(veh, dtype=float).reshape(rows, len(ZONES_M))
-
-    def _by_group(self, counts: Sequence[int]) -> Floats:
-        """(G,) what all areas count, by lane group; who is before the lanes part is shared out as the traffic is."""
-        own = np.asarray(np.bincount(self._area_group, counts[: len(self._areas)], self._groups), dtype=float)
-        if not self._before:
+    def _by_group(self, veh: Floats) -> Floats:
+        """(G,) counts by lane group, of (G + Z,) with those before the lanes part, shared out as traffic is."""
+        own = veh[: self._groups]
+        if not self._is_shared:
             return own
-        before = np.bincount(self._before_link, counts[len(self._areas) :], self._links)
-        return np.asarray(own + before[self._group_link] * self._share)
+        return np.asarray(own + veh[self._groups :][self._group_link] * self._share)
+
+
+class _Detectors:
+    """Detectors whose counts add up by place: by link, by lane group, or by zone of it."""
+
+    def __init__(self, names: Sequence[Sequence[str]], junction: Ints):
+        """`names` of those at each place, before which `junction` it is."""
+        self._places = len(names)
+        order = np.argsort(junction, kind="stable")
+        counts = np.array([len(names[place]) for place in order], dtype=np.int64)
+        self._place = np.repeat(order, counts)
+        self._names = list(chain.from_iterable(names[place] for place in order))
+        ends = np.cumsum(np.bincount(junction[order], counts)).astype(np.int64).tolist()
+        self._parts = [
+            (self._names[begin:end], [0] * (end - begin)) for begin, end in zip([0, *ends[:-1]], ends, strict=True)
+        ]
+        """Of each junction the names of its detectors, and as many that see nobody."""
+
+    def read(self, getter: Any, junctions: Bools | None = None) -> Floats:
+        """(places,) what a getter has; of `junctions` (J,) alone if they are said, 0 elsewhere."""
+        if junctions is None:
+            seen = list(map(getter, self._names))
+        else:
+            seen = []
+            for asked, (names, nobody) in zip(junctions.tolist(), self._parts, strict=True):
+                seen += map(getter, names) if asked else nobody
+        return np.asarray(np.bincount(self._place, seen, self._places), dtype=float)
 
 
 class Sight:
@@ -135,22 +145,18 @@ class Sight:
         self.free = free
         self.near_one_veh = eyes.near_one_veh
         self.gap_one_s = eyes.gap_one_s
+        self.zone_veh = eyes.zone_veh
         self._eyes = eyes
 
     @cached_property
     def waiting_veh(self) -> Floats:
         """(G,) standing in the lane-area detectors, by lane group."""
-        return self._eyes.waiting_veh(self.time_s)
+        return self._eyes.waiting_veh()
 
     @cached_property
     def near_veh(self) -> Floats:
         """(G,) in the lane-area detectors, moving or not, by lane group."""
-        return self._eyes.near_veh(self.time_s)
-
-    @cached_property
-    def zone_veh(self) -> Floats:
-        """(G, zones) vehicles by lane group and by how far they are from the stop line."""
-        return self._eyes.zone_veh()
+        return self._eyes.near_veh()
 
     @cached_property
     def x_veh(self) -> Floats:
@@ -176,7 +182,7 @@ class Sight:
         return self._eyes.total_veh(self._crossed_veh)
 
 
-def _flat(groups: Sequence[Sequence[str]]) -> tuple[list[str], Ints]:
-    """All names one after the other, and which group each is of."""
-    counts = [len(group) for group in groups]
-    return list(chain.from_iterable(groups)), np.repeat(np.arange(len(groups)), counts).astype(np.int64)
+def _bare(sumo: Any, domain: str, getter: str) -> Any:
+    """A getter of libsumo, without the function in Python about it where there is one: half of a reading's time."""
+    module = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
+    return getattr(module, f"{domain}_{getter}", None) or getattr(getattr(sumo, domain), getter)

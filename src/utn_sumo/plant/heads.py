@@ -10,10 +10,10 @@ import numpy as np
 
 from utn_sumo import clearances
 from utn_sumo.clearances import Phases, Times
-from utn_sumo.contract import Bools, Floats, Ints, Network, Stage, View
+from utn_sumo.contract import Bools, Floats, Ints, Network, View
 
 MOST_PATIENCE_S = 150.0
-"""A stage that somebody has waited for so long comes next, whatever is wished."""
+"""Who has waited so long without green is served next, whatever is wished."""
 LONGEST_RED_S = 180.0
 """Where least greens and clearances are long it comes next sooner: nobody is to wait longer than this."""
 LOOK_S = 5.0
@@ -35,22 +35,22 @@ class Heads:
         """(J,) when it has had its least green."""
         self._ways: dict[tuple[int, int], Phases] = {}
         self._times = [Times.of(network, junction) for junction in network.junctions]
-        self._patience_s = _patience_s(network)
-        self._called_s = np.zeros(len(network.stages))
-        """(S,) since when somebody has been waiting for each stage."""
+        self._needs = np.hstack([network.serves, _walks(network)])
+        """(S, M + walks) which turns and which letters of pedestrians each stage has green for."""
+        self._junction = network.stage_junction[self._needs.argmax(axis=0)]
+        """(M + walks,) whose stages these are."""
+        self._patience_s = np.where(self._needs, _patience_s(network)[:, None], np.inf).min(axis=0)
+        self._since_s = np.zeros(self._needs.shape[1])
+        """(M + walks,) since when somebody has been waiting for each, without green meanwhile."""
         self._look_s = 0.0
         """When it is looked again who waits."""
         self._overdue: list[int] = []
-        """Stages that somebody has waited for too long, the longest last."""
+        """Stages for who has waited too long, for the longest last."""
         self._due: list[tuple[float, int, int, str]] = []
         """A heap of (time, junction, number, letters) still to be shown."""
         self._numbers = count()
         self.next_s = np.inf
         """When the next letters are due."""
-        self._served = np.sign(network.serves.astype(float) @ _turn_groups(network))
-        """(S, G) 1 where a stage lets a lane group go."""
-        self._walked = np.array([_is_walked(network, stage) for stage in network.stages])
-        """(S,) stages in which pedestrians go, whom no detector sees."""
 
     def start(self, now_s: float) -> None:
         """Show every junction's first stage."""
@@ -73,13 +73,9 @@ class Heads:
         return np.asarray(now_s >= self._ready_s)
 
     def patient(self, wish: Ints, view: View) -> Ints:
-        """(J,) the wish, but for stages that somebody has waited for too long: these come next, the longest first."""
+        """(J,) the wish, but where somebody has waited for too long: whom the longest, is served next."""
         if view.time_s >= self._look_s:
-            called = self._walked | (self._served @ view.waiting_veh > 0)
-            called[view.stage] = False
-            self._called_s[~called] = view.time_s
-            late = np.flatnonzero(self._called_s + self._patience_s <= view.time_s)
-            self._overdue = sorted(late.tolist(), key=lambda stage: -self._called_s[stage])
+            self._overdue = self._late(view)
             self._look_s = view.time_s + LOOK_S
         if not self._overdue:
             return wish
@@ -87,6 +83,19 @@ class Heads:
         for stage in self._overdue:
             kept[self.network.stages[stage].junction] = stage
         return kept
+
+    def _late(self, view: View) -> list[int]:
+        """Stages for who has waited too long: of those that serve them, the one that most others wait for too."""
+        turn_group, present = self.network.turn_group, view.stage[self._junction]
+        waits = np.ones(len(self._since_s), dtype=np.bool_)
+        # Pedestrians, whom no detector sees, may always be waiting.
+        waits[: len(turn_group)] = view.waiting_veh[turn_group] > 0
+        waits &= ~self._needs[present, np.arange(len(waits))]
+        self._since_s[~waits] = view.time_s
+        late = np.flatnonzero(self._since_s + self._patience_s <= view.time_s)
+        called = self._needs @ waits.astype(np.int64)
+        longest_last = sorted(late.tolist(), key=lambda who: -self._since_s[who])
+        return [int(np.argmax(np.where(self._needs[:, who], called, -1))) for who in longest_last]
 
     def switch(self, index: int, stage: int, now_s: float) -> None:
         """Lead a junction that is free to another of its stages."""
@@ -115,12 +124,11 @@ def _patience_s(network: Network) -> Floats:
     return np.asarray(np.clip(LONGEST_RED_S - LOOK_S - others_s, LOOK_S, MOST_PATIENCE_S))
 
 
-def _turn_groups(network: Network) -> Floats:
-    """(M, G) 1 where a turn queues in a lane group."""
-    return np.equal.outer(network.turn_group, np.arange(len(network.groups))).astype(float)
-
-
-def _is_walked(network: Network, stage: Stage) -> bool:
-    """Whether a stage has green for letters that are no vehicles'."""
-    letters = network.junctions[stage.junction].without_yellow
-    return any(stage.state[letter] in clearances.GREEN for letter in letters)
+def _walks(network: Network) -> Bools:
+    """(S, walks) which letters that are no vehicles' each stage has green for."""
+    walks = [(index, letter) for index, junction in enumerate(network.junctions) for letter in junction.without_yellow]
+    green = [
+        [stage.junction == index and stage.state[letter] in clearances.GREEN for index, letter in walks]
+        for stage in network.stages
+    ]
+    return np.reshape(np.array(green, dtype=np.bool_), (len(network.stages), len(walks)))

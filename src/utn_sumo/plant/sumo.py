@@ -199,7 +199,7 @@ class SumoPlant:
                 np.maximum(peak_x, x_veh, out=peak_x)
                 spent_veh_s += self._present() * (self.time_s - sampled_s)
                 sampled_s = self.time_s
-                self.waiting.append((self.time_s, self._eyes.waiting_veh(self.time_s) > 0))
+                self.waiting.append((self.time_s, self._eyes.waiting_veh() > 0))
                 queue_veh = self._by_link("getLastStepHaltingNumber")
                 np.maximum(peak_queue, queue_veh, out=peak_queue)
             pending = self._sumo.edge.getPendingVehicles

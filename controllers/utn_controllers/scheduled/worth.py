@@ -1,0 +1,105 @@
+"""What a vehicle of each stream is worth, and how many of them go in a bin of green: by how full links are."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from utn_controllers.compiling import compiled
+from utn_controllers.scheduled.pockets import rooms_veh
+from utn_controllers.scheduled.streams import Streams
+from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
+
+FADING = 0.2
+"""Over what share of its storage about `full` a link is fed less and less."""
+LEAST_WORTH = 0.05
+"""Of a vehicle that would go from an empty link into a full one."""
+BLOCKED_VEH = 1e-6
+"""What leaves in a bin where nobody goes, or is to go."""
+LASTING_S = 100.0
+"""Over what time queues are taken that hold up those behind them: within a cycle all come and go."""
+DENSE = 0.3
+"""Share of the room in sight from which on, over that time, a queue holds up who is behind it."""
+
+
+class Worth:
+    """Keeps how dense lane groups have been of late."""
+
+    def __init__(self, network: Network, streams: Streams, *, crowding: float, blocking: float, full: float):
+        self._network, self._streams = network, streams
+        self._settings = crowding, blocking, full
+        group_veh, before_veh = rooms_veh(network)
+        self._room = group_veh, before_veh
+        self._dense = np.zeros(len(network.groups))
+        """(G,) share of their room in sight that vehicles have taken up of late."""
+        self._looked_s = np.zeros(len(network.groups))
+        """(G,) when that was looked at."""
+
+    def look(
+        self,
+        time_s: float,
+        asked: Bools,
+        zones: tuple[Floats, Floats],
+        x: Floats,
+        shares: tuple[Floats, Floats],
+        most: Floats,
+        stuck: Bools,
+        held: Floats,
+    ) -> tuple[Floats, Floats]:
+        """(N,) what a vehicle of each stream is worth, (N,) how many leave in a bin of green.
+
+        By the vehicles in `zones` (View.zone_veh) before the junctions `asked` (J,) and on all links `x` (Z,); the
+        `shares` of their links' traffic that streams (N,) and lane groups (G,) have; the `most` (N,) that can leave
+        of each stream, whether it is `stuck` (N,) before its green, and how much more lane groups (G,) weigh who hold
+        others up.
+        """
+        network, streams = self._network, self._streams
+        _lasting(
+            time_s, asked[network.link_junction[network.group_link]], network.group_link, *zones, *self._room,
+            shares[1], self._dense, self._looked_s,
+        )  # fmt: skip
+        worth, moving = _worth(
+            x / network.storage_veh, self._dense, streams.link, streams.group, streams.next_link, shares[0], most,
+            stuck, held, *self._settings,
+        )  # fmt: skip
+        return worth, moving
+
+
+@compiled
+def _lasting(
+    time_s: float, asked: Bools, group_link: Ints, zone: Floats, upstream: Floats, room: Floats, before: Floats,
+    share: Floats, dense: Floats, looked_s: Floats,
+) -> None:  # fmt: skip
+    """Brings `dense` (G,) up to date where somebody has looked."""
+    for group, link in enumerate(group_link):
+        if asked[group]:
+            veh = zone[group].sum() + share[group] * upstream[link].sum()
+            now = min(veh / max(room[group] + share[group] * before[link], 1.0), 1.0)
+            dense[group] += (1 - np.exp((looked_s[group] - time_s) / LASTING_S)) * (now - dense[group])
+            looked_s[group] = time_s
+
+
+@compiled
+def _worth(
+    taken: Floats, dense: Floats, links: Ints, groups: Ints, next_links: Ints, of_link: Floats, most: Floats,
+    stuck: Bools, held: Floats, crowding: float, blocking: float, full: float,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    queue = np.maximum(dense - DENSE, 0.0) / (1 - DENSE)
+    feeding, behind = np.zeros(len(taken)), np.zeros(len(taken))
+    for stream, ahead in enumerate(next_links):
+        if ahead != EXIT:
+            feeding[ahead] += of_link[stream]
+            behind[ahead] += of_link[stream] * queue[groups[stream]]
+    worth, moving = np.empty(len(links)), most.copy()
+    for stream, ahead in enumerate(next_links):
+        link = links[stream]
+        there = taken[ahead] if ahead != EXIT else 0.0
+        # A queue takes the room of those who would come onto its link, the more of them wait behind.
+        blocks = queue[groups[stream]] * behind[link] / feeding[link] if feeding[link] > 0 else 0.0
+        value = max(1 + crowding * (taken[link] - there) + blocking * blocks, LEAST_WORTH)
+        worth[stream] = held[groups[stream]] * value
+        fed = (full + FADING / 2 - there) / FADING
+        if fed < 1:
+            moving[stream] = max(fed * most[stream], BLOCKED_VEH)
+        if stuck[stream]:
+            moving[stream] = BLOCKED_VEH
+    return worth, moving
