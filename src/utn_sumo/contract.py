@@ -56,6 +56,8 @@ class Link:
     """SUMO lanes, inside nodes without signals, over which traffic comes onto the link amid it."""
     parting: tuple[str, ...] = ()
     """Those over which it leaves amid it."""
+    begins_amid: bool = False
+    """Whether it begins amid the net without another link that leads to it: nobody sees who waits behind its queue."""
     entry_flow_veh_s: float = np.inf
     """Most that comes from outside however much room there is: where its vehicles are inserted is not the road's."""
 
@@ -275,6 +277,11 @@ class Network:
     def is_source(self) -> Bools:
         """(Z,) whether traffic from outside enters the link."""
         return np.array([link.is_source for link in self.links], dtype=np.bool_)
+
+    @cached_property
+    def begins_amid(self) -> Bools:
+        """(Z,) whether roads that are no links lead to the link, and no others."""
+        return np.array([link.begins_amid for link in self.links], dtype=np.bool_)
 
     @cached_property
     def turning_worth_veh(self) -> Floats:

@@ -116,6 +116,7 @@ def test_a_road_is_not_followed_round_a_dead_end(street_of: StreetOf) -> None:
     net = street_of(turnaround)
     assert link(net, "W-A").edges == ("W-A",)
     assert link(net, "W-A").is_source
+    assert not link(net, "W-A").begins_amid
     assert (link(net, "W-A").joining, link(net, "W-A").parting) == ((), ())
 
 
@@ -123,6 +124,7 @@ def test_a_roundabout_is_the_end_of_the_roads_that_lead_out_of_it(street_of: Str
     net = street_of(odd_nets.roundabout)
     assert [link(net, name).edges for name in ("rw-A", "re-B")] == [("rw-A",), ("re-B",)]
     assert all(link(net, name).is_source for name in ("rw-A", "re-B"))
+    assert {each.id for each in net.links if each.begins_amid} == {"rw-A", "re-B"}
     onto = {turn.to_edge for turn in net.turns if turn.to_edge in ("A-rw", "B-re")}
     assert onto == {"A-rw", "B-re"}
     assert all(turn.next_link == EXIT for turn in net.turns if turn.to_edge in onto)

@@ -562,6 +562,37 @@ class TestExecution:
         assert chosen[0] == view.stage[junction]
         assert blocking or set(chosen) == {view.stage[junction]}
 
+    @pytest.mark.parametrize("hemmed", ["8", "9"])
+    @pytest.mark.parametrize("amid", [False, True])
+    def test_a_queue_that_reaches_back_onto_roads_unseen_goes_first(
+        self, hemmed: str, amid: bool, utn17: Network
+    ) -> None:
+        name = [link.id for link in utn17.links]
+        links = tuple(replace(link, begins_amid=amid and link.id == hemmed) for link in utn17.links)
+        queued = [name.index("8"), name.index("9")]
+        full = np.isin(np.arange(len(name)), queued)
+        near_veh = np.where(full[utn17.group_link], 45.0, 0.0)
+        junction = utn17.link_junction[queued[0]]
+        execution, chosen = Scheduled(replace(utn17, links=links)), set()
+        for now_s in np.arange(0.0, 300.0, 2.0):
+            view = replace(
+                scene(utn17, now_s),
+                group_zone_veh=by_the_line(near_veh),
+                x_veh=full * utn17.storage_veh,
+                left_veh=np.full(len(name), now_s),
+            )
+            wish = int(execution.wish(view)[junction])
+            chosen.add(wish)
+        # Of queues alike whoever has green goes on.
+        shown = view.stage[junction]
+        first = next(
+            stage
+            for stage in utn17.junctions[junction].stages
+            if utn17.serves[stage, utn17.turn_link == name.index(hemmed)].any()
+        )
+        assert chosen == ({shown, first} if amid else {shown})
+        assert wish == (first if amid else shown)
+
     @pytest.mark.parametrize(
         ("goes", "stands", "stays"), [(False, True, False), (True, True, True), (False, False, True)]
     )

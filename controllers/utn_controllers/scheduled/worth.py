@@ -58,8 +58,8 @@ class Worth:
             shares[1], self._dense, self._looked_s,
         )  # fmt: skip
         worth, moving = _worth(
-            x / network.storage_veh, self._dense, streams.link, streams.group, streams.next_link, shares[0], most,
-            stuck, held, *self._settings,
+            x / network.storage_veh, self._dense, network.begins_amid, streams.link, streams.group, streams.next_link,
+            shares[0], most, stuck, held, *self._settings,
         )  # fmt: skip
         return worth, moving
 
@@ -79,12 +79,19 @@ def _lasting(
 
 
 @compiled
+def _lasts(dense: Floats) -> Floats:
+    """By how much queues as dense as this hold up who is behind them, 0 to 1."""
+    return np.maximum(dense - DENSE, 0.0) / (1 - DENSE)
+
+
+@compiled
 def _worth(
-    taken: Floats, dense: Floats, links: Ints, groups: Ints, next_links: Ints, of_link: Floats, most: Floats,
-    stuck: Bools, held: Floats, crowding: float, blocking: float, full: float,
+    taken: Floats, dense: Floats, amid: Bools, links: Ints, groups: Ints, next_links: Ints, of_link: Floats,
+    most: Floats, stuck: Bools, held: Floats, crowding: float, blocking: float, full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    queue = np.maximum(dense - DENSE, 0.0) / (1 - DENSE)
-    feeding, behind = np.zeros(len(taken)), np.zeros(len(taken))
+    queue = _lasts(dense)
+    # Where nobody sees who waits behind a link, its own vehicles say it.
+    feeding, behind = amid.astype(np.float64), amid * _lasts(np.minimum(taken, 1.0))
     for stream, ahead in enumerate(next_links):
         if ahead != EXIT:
             feeding[ahead] += of_link[stream]

@@ -18,7 +18,7 @@ from utn_sumo.contract import EXIT, SAMPLE_S, Junction, LaneGroup, Link, Network
 from utn_sumo.errors import NetworkError, did_you_mean
 from utn_sumo.network import programmes
 from utn_sumo.network.programmes import MIN_GREEN_S, SHORT_GREEN_S, Block, Phase
-from utn_sumo.network.roads import Chain, Roads, for_motors, lane_groups, motor_lanes, usual_weight
+from utn_sumo.network.roads import Chain, Roads, for_motors, lane_groups, leads_on, motor_lanes, usual_weight
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
 from utn_sumo.xml_files import opened, stem
@@ -232,6 +232,7 @@ class _Reader:
             queue_spacing_m=self.space_m * length / lane_m,
             saturation_flow_veh_s=lanes[-1] * SATURATION_FLOW_VEH_S_LANE,
             is_source=not fed,
+            begins_amid=not fed and leads_on(edges[0]),
             turning_worth_veh=self._worth_veh(chain.edges[-1]),
             joining=chain.joining,
             parting=chain.parting,

@@ -32,6 +32,12 @@ def for_motors(connections: Iterable[Any]) -> list[Any]:
     return [each for each in connections if _admits_motors(each.getFromLane()) and _admits_motors(each.getToLane())]
 
 
+def leads_on(edge: Any) -> bool:
+    """Whether the road that an edge (sumolib) is of comes from elsewhere in the net, and not from its end."""
+    before = [other for other, each in edge.getIncoming().items() if for_motors(each)]
+    return any(other.getFromNode() is not edge.getToNode() for other in before)
+
+
 def usual_weight(connections: Iterable[Any]) -> float:
     """How much of an edge's traffic takes the turn that these connections make up, by their lanes; relative."""
     return sum(
