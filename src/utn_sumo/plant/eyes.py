@@ -34,12 +34,9 @@ class Eyes:
         self._entries = _Detectors(
             [(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)], network.link_junction
         )
-        turn_exits = [
-            [name for turn in np.flatnonzero(network.turn_link == link) for name in ids.turn[turn]]
-            for link in range(self._links)
-        ]
+        # Counted at the stop line: who changes lanes just there is missed now and then, but loops are half as many.
         self._exits = _Detectors(
-            [(*a, *b) for a, b in zip(turn_exits, ids.parting, strict=True)], network.link_junction
+            [(*a, *b) for a, b in zip(ids.stop_line, ids.parting, strict=True)], network.link_junction
         )
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]

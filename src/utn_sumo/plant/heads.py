@@ -93,6 +93,8 @@ class Heads:
         waits &= ~self._needs[present, np.arange(len(waits))]
         self._since_s[~waits] = view.time_s
         late = np.flatnonzero(self._since_s + self._patience_s <= view.time_s)
+        if not len(late):
+            return []
         called = self._needs @ waits.astype(np.int64)
         longest_last = sorted(late.tolist(), key=lambda who: -self._since_s[who])
         return [int(np.argmax(np.where(self._needs[:, who], called, -1))) for who in longest_last]
