@@ -368,22 +368,27 @@ def scale(side: int, as_json: bool) -> None:
 @click.option("--hours", default=2.0, show_default=True)
 @click.option("--demands", default="1.0,1.2,1.3,1.5", show_default=True)
 @click.option("--lost", default="0.05,0.08,0.11", show_default=True, help="Shares of the time with no green.")
+@click.option("--measured", metavar="CONTROLLER", help="With the flows that its queues have, seed 1: no bound.")
 @click.option("--json", "as_json", is_flag=True)
-def bound(net: str, hours: float, demands: str, lost: str, as_json: bool) -> None:
+def bound(net: str, hours: float, demands: str, lost: str, measured: str | None, as_json: bool) -> None:
     """Delay that no controller can go below: the linear programme of tools/bounding.py."""
-    found = streets.named(net)
-    rows = [
-        {"demand": float(scale), "lost": float(share), "least_delay_veh_h": bounding.least_delay_veh_h(
-            found, mean_profile_veh_h(found, "peak", round(hours * 30), float(scale)), hours, step_s=20.0,
-            lost=float(share),
-        )}
-        for scale in _words(demands) for share in _words(lost)
-    ]  # fmt: skip
+    found, rows = streets.named(net), []
+    for scale in _words(demands):
+        flowing = found
+        if measured is not None:
+            with tempfile.TemporaryDirectory() as temporary:
+                bridge.run(scenario(net=net, controller=measured, hours=hours, demand=scale), Path(temporary) / "run")
+                flowing = bounding.with_flows_of(found, Path(temporary) / "run")
+        demand_veh_h = mean_profile_veh_h(found, "peak", round(hours * 30), float(scale))
+        for share in _words(lost):
+            least_veh_h = bounding.least_delay_veh_h(flowing, demand_veh_h, hours, step_s=20.0, lost=float(share))
+            rows.append({"demand": float(scale), "lost": float(share), "least_delay_veh_h": least_veh_h})
     if as_json:
         click.echo(json.dumps(rows))
         return
     cells = [[f"{row['demand']:g}", f"{row['lost']:.0%}", f"{row['least_delay_veh_h']:.0f}"] for row in rows]
-    _show(f"no less delay on {net}, {hours:g} h", ["demand", "time lost", "veh h"], cells)
+    title = f"no less delay on {net}, {hours:g} h" + (f", with the flows of {measured}" if measured else "")
+    _show(title, ["demand", "time lost", "veh h"], cells)
 
 
 def _words(text: str) -> list[str]:

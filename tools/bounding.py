@@ -5,16 +5,51 @@ by starting or braking, storage is kept, and links discharge at the network's sa
 is charged is a share of the time that goes to clearances. What is left is delay that no control can take away: more
 vehicles than the junctions can serve. It is below the mean over runs whose demand is drawn about the one given, since
 the least delay is convex in the demand; a single run may have drawn less.
+
+With the flows that queues had in a run it is no bound, but what could be had if nobody ever waited at such a red.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
+from utn_sumo import metrics, recording
 from utn_sumo.contract import EXIT, Floats, Network
 from utn_sumo.errors import UtnError
+
+QUEUE_VEH = 10.0
+"""A link with so many standing at both ends of a control step had a queue all through it."""
+LEAST_GREEN_S = 10.0
+"""Less green in a step says little about the flow in it."""
+FREELY = 0.75
+"""Of the steps in which a link had a queue so many had less flow than it is said to have: some were blocked."""
+
+
+def with_flows_of(network: Network, folder: Path) -> Network:
+    """The network with the flow of green that each link's queues had in a run, in the better control steps.
+
+    `folder` is what the run has left; a link that never had a queue keeps its saturation flow. Who goes on yellow is
+    counted to the green before. Raises ResultError.
+    """
+    log = recording.read_log(folder)
+    ends_s = network.control_step_s * np.arange(1, len(log.x_veh) + 1)
+    greens = metrics.Greens(network, folder / "signals.xml", float(ends_s[-1]))
+    standing = log.true_queue_veh[:, 0] >= QUEUE_VEH
+    queued = standing & np.vstack([np.zeros(len(network.links), dtype=bool), standing[:-1]])
+    green_s, links = greens.by_turn_s(ends_s.tolist()), []
+    for index, link in enumerate(network.links):
+        own = network.turn_link == index
+        lit_s = green_s[:, own].max(axis=1)
+        counts = queued[:, index] & (lit_s >= LEAST_GREEN_S)
+        flow_veh_s = log.turned_veh[counts, 0][:, own].sum(axis=1) / lit_s[counts]
+        saturated = float(np.quantile(flow_veh_s, FREELY)) if counts.any() else link.saturation_flow_veh_s
+        links.append(replace(link, saturation_flow_veh_s=saturated))
+    return replace(network, links=tuple(links))
 
 
 def least_delay_veh_h(network: Network, demand_veh_h: Floats, hours: float, *, step_s: float, lost: float) -> float:

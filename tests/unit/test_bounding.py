@@ -49,3 +49,15 @@ def test_a_run_has_more_delay(utn17: Network, tmp_path: Path) -> None:
     chosen = scenario(profile="constant", demand=1.5, hours=0.5)
     result = bridge.run(chosen, tmp_path / "run")
     assert bound(utn17, 1.5 * 800, 0.05) < result["total_delay_veh_h"]
+    # Its queues went about as fast as queues should, but for where they could not.
+    flowing = bounding.with_flows_of(utn17, tmp_path / "run")
+    share = flowing.saturation_flow_veh_s / utn17.saturation_flow_veh_s
+    assert 3 < np.count_nonzero(share != 1.0) < len(share)
+    assert 0.7 < np.median(share) < share.max() < 1.15
+    assert share.min() > 0.1
+
+
+def test_flows_are_those_of_links_that_had_a_queue(utn17: Network, tmp_path: Path) -> None:
+    bridge.run(scenario(demand=0.2, hours=0.2), tmp_path / "run")
+    flowing = bounding.with_flows_of(utn17, tmp_path / "run")
+    assert (flowing.saturation_flow_veh_s == utn17.saturation_flow_veh_s).all()
