@@ -636,7 +636,7 @@ class View(Protocol):
 
     @property
     def left_veh(self) -> Floats:
-        """(Z,) vehicles that have left each link since the run began, but for who ends on it."""
+        """(G,) vehicles that have left over the stop line of each lane group since the run began."""
         ...
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:

@@ -35,7 +35,7 @@ NEAR_ENOUGH = 1.1
 
 @dataclass
 class Crossing:
-    """A junction whose every stage serves one stream of its own."""
+    """A junction whose every stage serves one stream of its own, and some let others go more slowly."""
 
     clearance: tuple[int, ...] = (2, 2)
     least: tuple[int, ...] = (2, 2)
@@ -43,6 +43,15 @@ class Crossing:
     cyclic: bool = False
     held: dict[tuple[int, int], Shares] = field(default_factory=dict)
     """Share of each bin that each stream has green in the clearance from a stage to another: else all is red."""
+    slowly: dict[tuple[int, int], float] = field(default_factory=dict)
+    """Share of its discharge that a stream has in another's stage."""
+
+    def green(self) -> Floats:
+        """(S, N) share of its discharge that each stream has in each stage."""
+        share = np.eye(len(self.clearance))
+        for (stage, stream), slow in self.slowly.items():
+            share[stage, stream] = max(slow, share[stage, stream])
+        return share
 
     def cleared(self, stage: int, other: int) -> Floats:
         """(bins, N) what moves in the clearance from a stage to another."""
@@ -53,7 +62,7 @@ class Crossing:
         stages = len(self.clearance)
         place = np.arange(stages)
         follows = place == ((place + 1) % stages)[:, None] if self.cyclic else np.ones((stages, stages), dtype=bool)
-        moves, clearing = np.eye(stages), np.full((stages, stages), -1)
+        moves, clearing = self.green(), np.full((stages, stages), -1)
         clearance = np.ones((stages, stages), dtype=np.int64)
         for stage, other in np.ndindex(stages, stages):
             shares = self.cleared(stage, other)
@@ -152,7 +161,8 @@ def plainly(drawn: Drawn, rest: int) -> tuple[set[int], float]:
     """The same programme, each bin gone through anew for each way: what may be led to first, and the least cost."""
     crossing, stand = drawn[0], np.array(drawn[1])
     bins, stages, ends = crossing.bins, len(stand), list[tuple[float, int]]()
-    called = [stage for stage in range(stages) if stage == 0 or stand[stage] + sum(drawn[2][stage]) > 0]
+    green, comes = crossing.green(), stand + np.sum(drawn[2], axis=1) > 0
+    called = [stage for stage in range(stages) if stage == 0 or (comes & (green[stage] > green[0])).any()]
     # (begin, stage): cost, queues, the stage led to in the first bin.
     states = {(0, 0): (0.0, stand, 0)}
     for begin, stage in np.ndindex(bins, stages):
@@ -166,13 +176,13 @@ def plainly(drawn: Drawn, rest: int) -> tuple[set[int], float]:
                     if other == stage:
                         continue
                     until, cleared, opens = spent, queue, now
-                    for green in crossing.cleared(stage, other)[: bins - now]:
-                        cost, cleared = a_bin(green, opens, cleared, drawn)
+                    for still in crossing.cleared(stage, other)[: bins - now]:
+                        cost, cleared = a_bin(still, opens, cleared, drawn)
                         until, opens = until + cost, opens + 1
                     if until < states.get((opens, other), (np.inf,))[0] - 1e-9:
                         states[opens, other] = until, cleared, other if now == 0 else first
             if now < last:
-                cost, queue = a_bin(np.eye(stages)[stage], now, queue, drawn)
+                cost, queue = a_bin(green[stage], now, queue, drawn)
                 spent += cost
     ends += [(cost, first) for (begin, _), (cost, _, first) in states.items() if begin == bins]
     least = min(ends, key=lambda end: end[0])[0]
@@ -197,13 +207,17 @@ def junctions(draw: st.DrawFn, stages: int = 2) -> Drawn:
 
 @st.composite
 def holding(draw: st.DrawFn) -> Drawn:
-    """Two stages or three, with clearances of any length in some of which some streams have green for a while."""
+    """Two stages or three, with clearances of any length in some of which some streams have green for a while.
+
+    In some stages some go more slowly than in their own.
+    """
     drawn = draw(st.integers(2, 3).flatmap(junctions))
     stages = len(drawn[1])
     shares = lists(st.sampled_from([0.0, 0.0, 0.5, 1.0]), stages)
     pairs = st.tuples(st.integers(0, stages - 1), st.integers(0, stages - 1))
     held = draw(st.dictionaries(pairs, st.lists(shares, min_size=1, max_size=4), max_size=6))
-    return replace(drawn[0], held=held), *drawn[1:]
+    slowly = draw(st.dictionaries(pairs, st.sampled_from([0.25, 0.5]), max_size=2))
+    return replace(drawn[0], held=held, slowly=slowly), *drawn[1:]
 
 
 class TestProgramme:
@@ -288,6 +302,14 @@ class TestProgramme:
         wish, sent = Crossing().decide([0.0, 1.0])
         assert wish == 1
         assert np.flatnonzero(sent[1]).tolist() == [2]
+
+    def test_who_goes_slowly_gets_a_stage_of_their_own_where_that_is_worth_its_clearance(self) -> None:
+        def shown(slow: float, stand: float) -> int:
+            return replace(Crossing(), slowly={(0, 1): slow}).decide([0.0, stand])[0]
+
+        assert [shown(slow, 8.0) for slow in (0.1, 0.5, 0.9, 1.0)] == [1, 1, 0, 0]
+        # A single one does not wait for the clearance either.
+        assert [shown(slow, 1.0) for slow in (0.1, 0.5)] == [1, 0]
 
     def test_green_that_is_held_through_the_clearance_serves(self) -> None:
         crossing = Crossing((3, 3), held={(0, 1): ((1.0, 0.0), (0.5, 0.0), (0.0, 0.0))})
@@ -520,7 +542,7 @@ class TestExecution:
         for bounds, leaves in (("none", False), ("plan", True)):
             execution = Scheduled(utn17, bounds=bounds)
             execution.begin(plan, Estimator(utn17, utn17).initial())
-            went_veh = np.ones(len(utn17.links))
+            went_veh = np.ones(len(utn17.groups))
             view = replace(scene(utn17, 500.0), group_zone_veh=by_the_line(near_veh), left_veh=went_veh)
             assert (execution.wish(view) != view.stage).all() == leaves
             # It has not been reached yet.
@@ -553,7 +575,7 @@ class TestExecution:
         junction = utn17.link_junction[name.index(hemmed)]
         execution, chosen = Scheduled(utn17, blocking=blocking), []
         for now_s in np.arange(0.0, 300.0, 2.0):
-            went_veh = np.full(len(name), now_s)
+            went_veh = np.full(len(utn17.groups), now_s)
             view = replace(scene(utn17, now_s), group_zone_veh=by_the_line(near_veh), left_veh=went_veh)
             chosen.append(int(execution.wish(view)[junction]))
         goes = [name.index(hemmed) in utn17.turn_link[utn17.serves[stage]] for stage in chosen]
@@ -579,7 +601,7 @@ class TestExecution:
                 scene(utn17, now_s),
                 group_zone_veh=by_the_line(near_veh),
                 x_veh=full * utn17.storage_veh,
-                left_veh=np.full(len(name), now_s),
+                left_veh=np.full(len(utn17.groups), now_s),
             )
             wish = int(execution.wish(view)[junction])
             chosen.add(wish)
@@ -605,7 +627,7 @@ class TestExecution:
         execution, begin_s = Scheduled(utn17), np.full(len(utn17.junctions), 30.0)
 
         def stay(now_s: float, begin_s: Floats) -> bool:
-            left_veh = np.full(len(utn17.links), now_s * goes)
+            left_veh = np.full(len(utn17.groups), now_s * goes)
             zone_veh = by_the_line(near_veh)
             view = replace(scene(utn17, now_s), group_zone_veh=zone_veh, left_veh=left_veh, begin_s=begin_s)
             return bool((execution.wish(view) == view.stage).all())

@@ -67,7 +67,7 @@ def scene(
         np.zeros(len(network.links)),
         groups + gap_s,
         np.zeros(len(network.links)),
-        np.zeros(len(network.links)),
+        groups,
         network.link_junction[network.group_link],
         network.link_junction,
     )

@@ -14,6 +14,7 @@ from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.worth import Worth
+from utn_controllers.scheduled.yielding import Yielding
 from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
 
 BIN_S = 2
@@ -65,6 +66,7 @@ class Scheduled:
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
         moves = Moves(network, self._streams, BIN_S)
+        self._yielding = Yielding(network, self._streams, moves.share)
         self._rules = Rules(
             stages,
             self._streams.first_stage,
@@ -77,6 +79,8 @@ class Scheduled:
         )
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules."""
+        self._row = np.argsort(stages)
+        """(S,) row of the rules in which each of the network's stages is."""
         self._endless = np.full(len(network.junctions), bins)
         self._green_s: Floats | None = None
         self._take_up()
@@ -91,10 +95,11 @@ class Scheduled:
 
     def wish(self, view: View | _Nobody) -> Ints:
         """(J,) stage that each junction's schedule begins with."""
-        zones = view.zone_veh(view.free)
+        zones, present = view.zone_veh(view.free), self._row[view.stage]
         outlook = self._outlook
         stand, come, held = outlook.look(view, zones)
-        stuck = self._standstill.look(view, stand)
+        stuck = self._standstill.look(view, present, stand)
+        self._yielding.look(view, view.free, present, zones[0])
         shares = outlook.of_link, outlook.group_share
         worth, most = self._worth.look(view.time_s, view.free, zones, view.x_veh, shares, self._most, stuck, held)
         if self._green_s is None:
@@ -119,11 +124,11 @@ class Scheduled:
 
     def _warm_up(self) -> None:
         """Have the machine code made now, not at the first decision."""
-        none = np.zeros(len(self.network.links))
+        none, nobody = np.zeros(len(self.network.links)), np.zeros(len(self.network.groups))
         stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
         zones = np.zeros((len(self.network.groups), len(ZONES_M))), np.zeros((len(none), len(ZONES_M)))
-        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, none))
+        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody))
 
     def _take_up(self) -> None:
         flow_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]

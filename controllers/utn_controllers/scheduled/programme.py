@@ -81,15 +81,16 @@ def _schedule(
 
 @compiled
 def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats) -> Bools:
-    """(s,) stages that somebody needs who has no green in the present one; if there are any, that one too.
+    """(s,) stages that somebody needs who goes slower or not at all in the present one; if there are any, that one too.
 
     In a fixed order the way to them leads through all.
     """
     called = np.zeros(stages, np.bool_)
     for stream in range(len(stand)):
-        if rules.moves[low + present, stream] == 0 and stand[stream] + come[stream].sum() >= SOME_VEH:
+        now = rules.moves[low + present, stream]
+        if now < 1 and stand[stream] + come[stream].sum() >= SOME_VEH:
             for stage in range(stages):
-                called[stage] |= rules.moves[low + stage, stream] > 0
+                called[stage] |= rules.moves[low + stage, stream] > now
     if called.any():
         called[present] = True
         called |= not rules.follows[low : low + stages, :stages].all()
@@ -158,7 +159,8 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 moving = 0.0
                 for place in range(greens):
                     stream = green[place]
-                    veh[stream] = max(veh[stream] + come[stream, now] - most[stream], 0.0)
+                    leaves = moves[low + stage, stream] * most[stream]
+                    veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
                     moving += worth[stream] * veh[stream]
                 spent, now = spent + moving, now + 1
             if now == bins and spent < best - ALIKE:
@@ -233,9 +235,10 @@ def _lead(begin: int, stage: int, low: int, whence: Ints, rules: Rules, traffic:
     row = rules.clearing[low + was, stage]
     for stream in range(len(traffic.most)):
         veh, since = queue[before, was, stream], before
-        if rules.moves[low + was, stream] > 0:
+        share = rules.moves[low + was, stream]
+        if share > 0:
             for place in range(before, end):
-                veh = max(veh + traffic.come[stream, place] - traffic.most[stream], 0.0)
+                veh = max(veh + traffic.come[stream, place] - share * traffic.most[stream], 0.0)
             since = end
         if row >= 0 and _goes(rules.moves, row, begin - end, stream):
             veh += traffic.came[stream, end] - traffic.came[stream, since]

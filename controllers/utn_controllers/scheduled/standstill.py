@@ -24,8 +24,6 @@ class Shown(Protocol):
     @property
     def time_s(self) -> float: ...
     @property
-    def stage(self) -> Ints: ...
-    @property
     def begin_s(self) -> Floats: ...
     @property
     def left_veh(self) -> Floats: ...
@@ -39,19 +37,21 @@ class Standstill:
         self._streams = streams
         self._after_s = after_s
         self._junction = network.link_junction
-        self._row = np.argsort(streams.stage)
-        """(S,) row of each of the network's stages in `streams.serves`."""
+        self._group_link = network.group_link
         self._went_s = np.zeros(len(network.links))
         self._left_veh = np.zeros(len(network.links))
 
-    def look(self, view: Shown, stand: Floats) -> Bools:
-        """(N,) streams that stand before green on a link from which nobody goes; `stand` (N,) vehicles."""
+    def look(self, view: Shown, present: Ints, stand: Floats) -> Bools:
+        """(N,) streams that stand before green on a link from which nobody goes; `stand` (N,) vehicles.
+
+        `present` (J,) is the row of each junction's stage in `Streams.serves`.
+        """
         return np.asarray(
             _look(
                 view.time_s,
-                self._row[view.stage],
+                present,
                 view.begin_s,
-                view.left_veh,
+                np.bincount(self._group_link, view.left_veh, len(self._left_veh)),
                 stand,
                 self._streams.serves,
                 self._streams.link,

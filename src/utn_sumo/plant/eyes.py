@@ -35,9 +35,7 @@ class Eyes:
             [(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)], network.link_junction
         )
         # Counted at the stop line: who changes lanes just there is missed now and then, but loops are half as many.
-        self._exits = _Detectors(
-            [(*a, *b) for a, b in zip(ids.stop_line, ids.parting, strict=True)], network.link_junction
-        )
+        self._exits = _Detectors([*ids.group_stop_line, *ids.parting], junction)
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
@@ -50,15 +48,15 @@ class Eyes:
         self._x_veh = np.zeros(self._links)
         """(Z,) vehicles on each link when the control step began."""
         self._entered_veh = np.zeros(self._links)
-        self._left_veh = np.zeros(self._links)
-        """(Z,) vehicles that had come onto each link by then, and that had left it."""
+        self._left_veh = np.zeros(self._groups)
+        """(Z,) vehicles that had come onto each link by then, (G,) that had crossed each lane group's stop line."""
 
     def begin(self, time_s: float, x_veh: Floats) -> None:
         """A control step begins, with so many vehicles on each link (Z,)."""
         self._x_veh = x_veh
         if time_s > 0:
             self._entered_veh = self._entered_veh + self._entries.read(self._counted_last)
-            self._left_veh = self._left_veh + self._exits.read(self._counted_last)
+            self._left_veh = self._left_veh + self._exits.read(self._counted_last)[: self._groups]
 
     def waiting_veh(self) -> Floats:
         """(G,) standing in the lane-area detectors."""
@@ -73,19 +71,25 @@ class Eyes:
         veh = self._zones.read(self._present, junctions).reshape(-1, len(ZONES_M))
         return veh[: self._groups], veh[self._groups :]
 
-    def crossed_veh(self, time_s: float) -> tuple[Floats, Floats]:
-        """(Z,) that have come onto each link since the control step began, and (Z,) that have left it."""
-        if time_s % self._step_s == 0:
-            return np.zeros(self._links), np.zeros(self._links)
-        return self._entries.read(self._counted), self._exits.read(self._counted)
+    def crossed_veh(self, time_s: float) -> tuple[Floats, Floats, Floats]:
+        """What has been counted since the control step began.
 
-    def total_veh(self, crossed_veh: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-        """The same since the run began."""
+        (Z,) who has come onto each link, (G,) left over each lane group's stop line, (Z,) left each link amid it.
+        """
+        if time_s % self._step_s == 0:
+            return np.zeros(self._links), np.zeros(self._groups), np.zeros(self._links)
+        left = self._exits.read(self._counted)
+        return self._entries.read(self._counted), left[: self._groups], left[self._groups :]
+
+    def total_veh(self, crossed_veh: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats]:
+        """(Z,) that have come onto each link, (G,) that have left over stop lines since the run began."""
         return self._entered_veh + crossed_veh[0], self._left_veh + crossed_veh[1]
 
-    def now_veh(self, crossed_veh: tuple[Floats, Floats]) -> Floats:
+    def now_veh(self, crossed_veh: tuple[Floats, Floats, Floats]) -> Floats:
         """(Z,) vehicles on each link after so many have come and left in this control step."""
-        return np.asarray(np.maximum(self._x_veh + crossed_veh[0] - crossed_veh[1], 0.0))
+        came, over, parted = crossed_veh
+        left = np.bincount(self._group_link, over, self._links) + parted
+        return np.asarray(np.maximum(self._x_veh + came - left, 0.0))
 
     def near_one_veh(self, group: int) -> float:
         """In the lane-area detectors of one lane group, moving or not."""
@@ -167,11 +171,11 @@ class Sight:
 
     @property
     def left_veh(self) -> Floats:
-        """(Z,) vehicles that have left each link since the run began, but for who ends on it."""
+        """(G,) vehicles that have left over the stop line of each lane group since the run began."""
         return self._total_veh[1]
 
     @cached_property
-    def _crossed_veh(self) -> tuple[Floats, Floats]:
+    def _crossed_veh(self) -> tuple[Floats, Floats, Floats]:
         return self._eyes.crossed_veh(self.time_s)
 
     @cached_property

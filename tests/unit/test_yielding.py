@@ -1,0 +1,113 @@
+"""Left turns that give way: as slow as they have been of late, and a stage of their own when they need it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.integration import odd_nets
+from tests.unit.views import by_the_line, scene
+from utn_controllers.scheduled.execution import Scheduled
+from utn_controllers.scheduled.moves import Moves
+from utn_controllers.scheduled.streams import Streams
+from utn_controllers.scheduled.yielding import LEAST_SHARE, Yielding
+from utn_sumo.contract import Floats, Network
+
+Make = Callable[[Path], Any]
+StreetOf = Callable[[Make], Network]
+QUEUE_VEH = 8.0
+
+
+def left_turns(network: Network) -> list[int]:
+    """Lane groups that give way in one stage and have another one to themselves."""
+    streams = Streams(network)
+    return np.flatnonzero(Yielding(network, streams, np.ones((len(streams.stage), 9)))._gives_way.any(axis=0)).tolist()
+
+
+def through_stage(network: Network, group: int) -> int:
+    """The stage in which it gives way."""
+    return next(
+        s for s, stage in enumerate(network.stages) if "g" in stage.state and turns_of(network, group) & {*stage.turns}
+    )
+
+
+def turns_of(network: Network, group: int) -> set[int]:
+    return set(np.flatnonzero(network.turn_group == group).tolist())
+
+
+@pytest.fixture
+def arrows(street_of: StreetOf) -> Network:
+    return street_of(odd_nets.actuated_left_turns)
+
+
+def test_left_turns_in_pockets_with_arrows_give_way_and_have_a_stage_of_their_own(arrows: Network) -> None:
+    groups = left_turns(arrows)
+    assert len(groups) == 4
+    assert all(len(arrows.groups[group].lanes) == 1 for group in groups)
+
+
+@pytest.mark.parametrize("make", [odd_nets.plain, odd_nets.pedestrians])
+def test_who_never_has_a_stage_alone_is_left_as_it_is(make: Make, street_of: StreetOf) -> None:
+    assert left_turns(street_of(make)) == []
+
+
+@pytest.mark.parametrize("flow", [0.0, 0.3, 1.0])
+def test_its_share_is_what_has_gone_of_late_and_is_forgotten(flow: float, arrows: Network) -> None:
+    streams = Streams(arrows)
+    moves = Moves(arrows, streams, 2).share
+    learning, group = Yielding(arrows, streams, moves), left_turns(arrows)[0]
+    stage = through_stage(arrows, group)
+    row, junction = np.array([streams.stage.tolist().index(stage)]), np.array([True])
+    present = np.where(np.arange(len(arrows.junctions)) == arrows.stages[stage].junction, row, 0)
+    saturated_veh_s = arrows.group_saturation_flow_veh_s
+
+    def look(now_s: float, zone: Floats) -> None:
+        view = replace(scene(arrows, now_s), left_veh=flow * saturated_veh_s * now_s)
+        learning.look(view, np.broadcast_to(junction, len(arrows.junctions)), present, zone)
+
+    queue = by_the_line(np.full(len(arrows.groups), QUEUE_VEH))
+    for now_s in np.arange(0.0, 200.0, 2.0):
+        look(now_s, queue)
+    share = learning._share[row[0], group]
+    assert share == pytest.approx(max(flow, LEAST_SHARE), abs=0.05)
+    own = np.flatnonzero((streams.group == group) & streams.serves[row[0]])
+    first = streams.first[arrows.stages[stage].junction]
+    assert (moves[row[0], own - first] == share).all()
+    # In the stage of its own it goes as fast as ever.
+    assert (learning._share[np.arange(len(streams.stage)) != row[0], group] == 1.0).all()
+    for now_s in np.arange(200.0, 20_000.0, 100.0):
+        look(now_s, np.zeros_like(queue))
+    assert learning._share[row[0], group] > 0.95
+
+
+@pytest.mark.parametrize(("goes", "changes"), [(False, True), (True, False)])
+def test_who_finds_no_gap_gets_the_stage_of_their_own(goes: bool, changes: bool, arrows: Network) -> None:
+    group = left_turns(arrows)[0]
+    stage = through_stage(arrows, group)
+    junction = arrows.stages[stage].junction
+    served = arrows.turn_group[list(arrows.stages[stage].turns)]
+    # They have a queue that does not end, and nobody else is there.
+    near_veh = np.zeros(len(arrows.groups))
+    near_veh[np.intersect1d(served, left_turns(arrows))] = QUEUE_VEH
+    shown = np.array([each.stages[0] for each in arrows.junctions])
+    shown[junction] = stage
+    flow_veh_s = arrows.group_saturation_flow_veh_s * np.where(
+        np.isin(np.arange(len(near_veh)), left_turns(arrows)), goes, 1
+    )
+    execution, wishes = Scheduled(arrows), []
+    for now_s in np.arange(0.0, 120.0, 2.0):
+        view = replace(scene(arrows, now_s, shown), group_zone_veh=by_the_line(near_veh), left_veh=flow_veh_s * now_s)
+        wishes.append(int(execution.wish(view)[junction]))
+    assert wishes[0] == stage
+    assert (wishes[-1] != stage) == changes
+    own = [
+        s
+        for s in arrows.junctions[junction].stages
+        if s != stage and turns_of(arrows, group) & {*arrows.stages[s].turns}
+    ]
+    assert wishes[-1] in ([*own] if changes else [stage])
