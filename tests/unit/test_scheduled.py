@@ -615,6 +615,29 @@ class TestExecution:
         assert chosen == ({shown, first} if amid else {shown})
         assert wish == (first if amid else shown)
 
+    @pytest.mark.parametrize("starving", [0.0, 2.0])
+    def test_who_has_waited_behind_a_queue_that_never_ends_is_let_go_some_time(
+        self, starving: float, utn17: Network
+    ) -> None:
+        name = [link.id for link in utn17.links]
+        near_veh = np.zeros(len(utn17.groups))
+        near_veh[np.isin(utn17.group_link, name.index("9"))] = 12.0
+        near_veh[np.isin(utn17.group_link, name.index("8"))] = 11.0
+        # Those of link 9 go, are gone for a moment, and as many come again; those of link 8 stand all the time.
+        junction = utn17.link_junction[name.index("8")]
+        execution, served = Scheduled(utn17, starving=starving, blocking=0.0), False
+        for step, now_s in enumerate(np.arange(0.0, 200.0, 2.0)):
+            there_veh = near_veh * np.where(utn17.group_link == name.index("9"), step % 10 > 0, 1.0)
+            went_veh = np.full(len(utn17.groups), now_s)
+            view = replace(scene(utn17, now_s), group_zone_veh=by_the_line(there_veh), left_veh=went_veh)
+            if step % 10:
+                served = (
+                    utn17.turn_link[utn17.serves[int(execution.wish(view)[junction])]].tolist() == [name.index("8")] * 2
+                )
+            else:
+                execution.wish(view)
+        assert served == (starving > 0)
+
     @pytest.mark.parametrize(
         ("goes", "stands", "stays"), [(False, True, False), (True, True, True), (False, False, True)]
     )

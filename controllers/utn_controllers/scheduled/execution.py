@@ -38,6 +38,8 @@ class ScheduledSettings(BaseModel):
     """By how much waiting on a full link costs more than on an empty one, in vehicles."""
     blocking: float = Field(4.0, ge=0, le=20)
     """By how much more it costs in a queue that others have to wait behind, one link back, in vehicles."""
+    starving: float = Field(0.5, ge=0, le=20)
+    """By how much more it costs where nobody has been let go to the last one for two minutes, in shares."""
     full: float = Field(0.4, gt=0, le=2)
     """Share of its storage about which a link is fed less and less: beyond it some lane is full and stops all."""
     standstill_s: float = Field(8.0, ge=2, le=200)
@@ -61,6 +63,7 @@ class Scheduled:
             self._streams,
             crowding=self.settings.crowding,
             blocking=self.settings.blocking,
+            starving=self.settings.starving,
             full=self.settings.full,
         )
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)

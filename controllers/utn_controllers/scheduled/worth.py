@@ -20,19 +20,26 @@ LASTING_S = 100.0
 DENSE = 0.3
 """Share of the room in sight from which on, over that time, a queue holds up who is behind it."""
 
+STARVED_S = 120.0
+"""Who has not been let go to the last one for so long weighs more by all of `starving`."""
+
 
 class Worth:
-    """Keeps how dense lane groups have been of late."""
+    """Keeps how dense lane groups have been of late, and when they were last empty."""
 
-    def __init__(self, network: Network, streams: Streams, *, crowding: float, blocking: float, full: float):
+    def __init__(
+        self, network: Network, streams: Streams, *, crowding: float, blocking: float, starving: float, full: float
+    ):
         self._network, self._streams = network, streams
-        self._settings = crowding, blocking, full
+        self._settings = crowding, blocking, starving, full
         group_veh, before_veh = rooms_veh(network)
         self._room = group_veh, before_veh
         self._dense = np.zeros(len(network.groups))
         """(G,) share of their room in sight that vehicles have taken up of late."""
         self._looked_s = np.zeros(len(network.groups))
         """(G,) when that was looked at."""
+        self._empty_s = np.zeros(len(network.groups))
+        """(G,) when nobody was by the stop line of each last."""
 
     def look(
         self,
@@ -55,11 +62,11 @@ class Worth:
         network, streams = self._network, self._streams
         _lasting(
             time_s, asked[network.link_junction[network.group_link]], network.group_link, *zones, *self._room,
-            shares[1], self._dense, self._looked_s,
+            shares[1], self._dense, self._looked_s, self._empty_s,
         )  # fmt: skip
         worth, moving = _worth(
             x / network.storage_veh, self._dense, network.begins_amid, streams.link, streams.group, streams.next_link,
-            shares[0], most, stuck, held, *self._settings,
+            shares[0], most, stuck, held, time_s - self._empty_s, *self._settings,
         )  # fmt: skip
         return worth, moving
 
@@ -67,15 +74,17 @@ class Worth:
 @compiled
 def _lasting(
     time_s: float, asked: Bools, group_link: Ints, zone: Floats, upstream: Floats, room: Floats, before: Floats,
-    share: Floats, dense: Floats, looked_s: Floats,
+    share: Floats, dense: Floats, looked_s: Floats, empty_s: Floats,
 ) -> None:  # fmt: skip
-    """Brings `dense` (G,) up to date where somebody has looked."""
+    """Brings `dense` (G,) and `empty_s` (G,) up to date where somebody has looked."""
     for group, link in enumerate(group_link):
         if asked[group]:
             veh = zone[group].sum() + share[group] * upstream[link].sum()
             now = min(veh / max(room[group] + share[group] * before[link], 1.0), 1.0)
             dense[group] += (1 - np.exp((looked_s[group] - time_s) / LASTING_S)) * (now - dense[group])
             looked_s[group] = time_s
+            if zone[group, 0] < 1:
+                empty_s[group] = time_s
 
 
 @compiled
@@ -87,7 +96,8 @@ def _lasts(dense: Floats) -> Floats:
 @compiled
 def _worth(
     taken: Floats, dense: Floats, amid: Bools, links: Ints, groups: Ints, next_links: Ints, of_link: Floats,
-    most: Floats, stuck: Bools, held: Floats, crowding: float, blocking: float, full: float,
+    most: Floats, stuck: Bools, held: Floats, unserved_s: Floats, crowding: float, blocking: float, starving: float,
+    full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
     queue = _lasts(dense)
     # Where nobody sees who waits behind a link, its own vehicles say it.
@@ -103,7 +113,9 @@ def _worth(
         # A queue takes the room of those who would come onto its link, the more of them wait behind.
         blocks = queue[groups[stream]] * behind[link] / feeding[link] if feeding[link] > 0 else 0.0
         value = max(1 + crowding * (taken[link] - there) + blocking * blocks, LEAST_WORTH)
-        worth[stream] = held[groups[stream]] * value
+        # With queues enough for the best stages there are others that would never be worth their clearance.
+        starved = min(unserved_s[groups[stream]] / STARVED_S, 1.0)
+        worth[stream] = held[groups[stream]] * (1 + starving * starved) * value
         fed = (full + FADING / 2 - there) / FADING
         if fed < 1:
             moving[stream] = max(fed * most[stream], BLOCKED_VEH)
