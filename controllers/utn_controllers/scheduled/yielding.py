@@ -6,11 +6,10 @@ it to itself, that one is to be shown in time.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from utn_controllers.compiling import compiled
+from utn_controllers.scheduled.standstill import Shown
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
@@ -24,17 +23,6 @@ FORGET_S = 300.0
 """Over how long what it was is forgotten, and the whole discharge expected again."""
 LEAST_SHARE = 0.05
 """Of the discharge: somebody may always find a gap."""
-
-
-class Shown(Protocol):
-    """What of a view it takes to know who goes (contract.View)."""
-
-    @property
-    def time_s(self) -> float: ...
-    @property
-    def begin_s(self) -> Floats: ...
-    @property
-    def left_veh(self) -> Floats: ...
 
 
 class Yielding:
