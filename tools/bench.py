@@ -53,7 +53,7 @@ from utn_sumo import (
 from utn_sumo.contract import Measurement
 from utn_sumo.demand import mean_profile_veh_h
 from utn_sumo.detectors import Miscount
-from utn_sumo.errors import UtnError
+from utn_sumo.errors import ResultError, SettingError, UtnError
 from utn_sumo.estimation import Estimator
 from utn_sumo.recording import Log
 from utn_sumo.scenario import scenario
@@ -378,7 +378,12 @@ def bound(net: str, hours: float, demands: str, lost: str, measured: str | None,
         if measured is not None:
             with tempfile.TemporaryDirectory() as temporary:
                 bridge.run(scenario(net=net, controller=measured, hours=hours, demand=scale), Path(temporary) / "run")
-                flowing = bounding.with_flows_of(found, Path(temporary) / "run")
+                try:
+                    flowing = bounding.with_flows_of(found, Path(temporary) / "run")
+                except ResultError as error:
+                    raise SettingError(
+                        f"--measured is {measured!r}, whose runs keep no counts by cycle: name another, as recommended"
+                    ) from error
         demand_veh_h = mean_profile_veh_h(found, "peak", round(hours * 30), float(scale))
         for share in _words(lost):
             least_veh_h = bounding.least_delay_veh_h(flowing, demand_veh_h, hours, step_s=20.0, lost=float(share))
