@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from tests.integration import odd_nets
 from tests.unit.views import scene
 from utn_controllers.scheduled.outlook import Outlook
-from utn_controllers.scheduled.pockets import held_up, rooms_veh
+from utn_controllers.scheduled.pockets import HOLDING, held_up, rooms_veh
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo import streets
-from utn_sumo.contract import ZONES_M, Network
+from utn_sumo.contract import ZONES_M, Floats, Network
 
 veh = st.floats(0, 40)
+ROOM_VEH, BEFORE_VEH = 10.0, 20.0
 
 
 @pytest.fixture(scope="module")
@@ -25,22 +26,57 @@ def pockets(tmp_path_factory: pytest.TempPathFactory) -> Network:
     return streets.named(str(odd_nets.turning_pockets(tmp_path_factory.mktemp("pockets"))))
 
 
+def held(
+    own: tuple[float, ...], before: float, far: float, cut: tuple[float, float] = (0.2, 0.3)
+) -> tuple[Floats, Floats]:
+    """Of a link of three lane groups, with so many on the `own` lanes of each, `before` they part and out of sight."""
+    zone, upstream = np.zeros((3, len(ZONES_M))), np.zeros((1, len(ZONES_M)))
+    zone[:, 0], upstream[0, 2] = own, before
+    share, x = np.array([*cut, 1 - sum(cut)]), np.array([sum(own) + before + far])
+    room, link = np.full(3, ROOM_VEH), np.zeros(3, dtype=np.int64)
+    return held_up(zone, upstream, x, share, room, np.array([BEFORE_VEH]), link)
+
+
 @given(own=st.tuples(veh, veh, veh), before=veh, far=veh, cut=st.tuples(st.floats(0.1, 0.4), st.floats(0.1, 0.4)))
 def test_whoever_waits_behind_is_weighed_with_those_in_front(
     own: tuple[float, ...], before: float, far: float, cut: tuple[float, float]
 ) -> None:
-    zone, upstream = np.zeros((3, len(ZONES_M))), np.zeros((1, len(ZONES_M)))
-    zone[:, 0], upstream[0, 2] = own, before
-    share, x = np.array([*cut, 1 - sum(cut)]), np.array([sum(own) + before + far])
-    room, link = np.full(3, 10.0), np.zeros(3, dtype=np.int64)
-    shut, weight = held_up(zone, upstream, x, share, room, np.array([20.0]), link)
-    full = (zone[:, 0] >= 7.5) & (before >= 8.0)
-    assert (weight[~full] == 1).all()
+    shut, weight = held(own, before, far, cut)
+    filled, dense = np.array(own) / ROOM_VEH, before / BEFORE_VEH
+    (own_from, own_to), (before_from, before_to) = HOLDING
+    nobody = (filled <= own_from) | (dense <= before_from)
+    full = (filled >= own_to) & (dense >= before_to)
+    assert weight[nobody] == pytest.approx(1.0)
     assert (weight >= 1 - 1e-9).all()
-    assert (shut == (~full & full.any())).all()
-    if full.any():
-        waiting_veh = zone[full, 0] + share[full] * (before + far)
-        assert weight[full] @ waiting_veh == pytest.approx(zone[full, 0].sum() + before + far)
+    assert ((shut >= 0) & (shut <= 1)).all()
+    if full.any() and (full | nobody).all():
+        share = np.array([*cut, 1 - sum(cut)])
+        waiting_veh = np.array(own)[full] + share[full] * (before + far)
+        assert weight[full] @ waiting_veh == pytest.approx(np.array(own)[full].sum() + before + far)
+
+
+def test_others_get_past_the_less_the_longer_the_queues_are() -> None:
+    shut = [held((fill * ROOM_VEH, 0.0, 0.0), fill * BEFORE_VEH, 0.0)[0] for fill in np.linspace(0, 1, 21)]
+    assert (np.diff(shut, axis=0) >= -1e-9).all()
+    assert shut[0] == pytest.approx(0.0)
+    assert shut[-1] == pytest.approx([0.0, 1.0, 1.0])
+
+
+@given(
+    own=st.tuples(veh, veh, veh),
+    before=veh,
+    far=veh,
+    where=st.integers(0, 3),
+    cut=st.tuples(st.just(0.2), st.just(0.3)),
+)
+def test_a_little_more_traffic_changes_no_weight_at_a_stroke(
+    own: tuple[float, ...], before: float, far: float, where: int, cut: tuple[float, float]
+) -> None:
+    """Else what is shown next would change with every vehicle that comes or goes."""
+    more = [*own, before]
+    more[where] += 0.01
+    for now, then in zip(held(own, before, far, cut), held(tuple(more[:3]), more[3], far, cut), strict=True):
+        assert then == pytest.approx(now, abs=0.2)
 
 
 def test_where_lanes_never_part_nobody_is_held_up(utn17: Network) -> None:

@@ -154,7 +154,7 @@ def _look(
         group, link = stream_group[stream], stream_link[stream]
         if not asked[link]:
             continue
-        of_upstream = 0.0 if shut[group] else of_link[stream]
+        of_upstream = (1 - shut[group]) * of_link[stream]
         stand[stream] = of_group[stream] * zone[group, 0] + of_upstream * upstream[link, 0]
         for place in range(bins):
             come[stream, place] = of_upstream * coming[link, place]

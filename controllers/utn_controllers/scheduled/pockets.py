@@ -9,12 +9,17 @@ from __future__ import annotations
 import numpy as np
 
 from utn_controllers.compiling import compiled
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import Floats, Ints, Network
 
-FULL = 0.75
-"""Share of the room on a lane group's own lanes from which on it is full."""
-DENSE = 0.4
-"""Share of the room on the lanes before them, as far as they are in sight, from which on there is a queue on them."""
+HOLDING = (0.35, 0.45), (0.08, 0.12)
+"""Shares of the room on a lane group's own lanes, and of that on the lanes before them as far as they are in sight,
+between which the queues on both come to hold others up."""
+SHUT = (0.4, 0.9), (0.1, 0.4)
+"""The same shares, between which fewer and fewer get past such a queue into the other lanes.
+
+One sharp limit would have what is worth most change from one decision to the next, and a pocket's stage put off again
+and again.
+"""
 
 
 def rooms_veh(network: Network) -> tuple[Floats, Floats]:
@@ -31,25 +36,39 @@ def rooms_veh(network: Network) -> tuple[Floats, Floats]:
 @compiled
 def held_up(
     zone: Floats, upstream: Floats, x: Floats, share: Floats, room: Floats, before: Floats, group_link: Ints
-) -> tuple[Bools, Floats]:
-    """(G,) lane groups into which nobody comes from before the lanes part, (G,) by how much those in them weigh more.
+) -> tuple[Floats, Floats]:
+    """(G,) how few come into a lane group from before the lanes part, 0 to 1; (G,) what a vehicle in it weighs.
 
     By the vehicles in zones (G, zones), (Z, zones) and on links `x` (Z,), the lane groups' `share` (G,) of the traffic,
     and the `room` of their lanes (G,) and of those `before` (Z,).
     """
-    full, shut, weight = np.zeros(len(zone), np.bool_), np.zeros(len(zone), np.bool_), np.ones(len(zone))
+    holds, shuts, weight = np.zeros(len(zone)), np.zeros(len(zone)), np.ones(len(zone))
     within, stuck_veh, stuck_share = np.zeros(len(x)), np.zeros(len(x)), np.zeros(len(x))
+    held, shut = np.zeros(len(x)), np.zeros(len(x))
     for group, link in enumerate(group_link):
         veh = zone[group].sum()
         within[link] += veh
-        full[group] = before[link] > 0 and upstream[link].sum() >= DENSE * before[link] and veh >= FULL * room[group]
-        if full[group]:
-            stuck_veh[link] += veh
-            stuck_share[link] += share[group]
+        if before[link] > 0:
+            own, dense = veh / room[group], upstream[link].sum() / before[link]
+            holds[group], shuts[group] = _queues(own, dense, HOLDING), _queues(own, dense, SHUT)
+            stuck_veh[link] += holds[group] * veh
+            stuck_share[link] += holds[group] * share[group]
+            held[link], shut[link] = max(held[link], holds[group]), max(shut[link], shuts[group])
     for group, link in enumerate(group_link):
-        if full[group]:
+        if held[link] > 0:
             behind = max(x[link] - within[link], upstream[link].sum())
-            weight[group] = (stuck_veh[link] + behind) / (stuck_veh[link] + behind * stuck_share[link])
-        else:
-            shut[group] = stuck_share[link] > 0
-    return shut, weight
+            veh, part = stuck_veh[link] / held[link], stuck_share[link] / held[link]
+            weight[group] += holds[group] * ((veh + behind) / (veh + behind * part) - 1)
+    return shut[group_link] - shuts, weight
+
+
+@compiled
+def _queues(own: float, before: float, limits: tuple[tuple[float, float], tuple[float, float]]) -> float:
+    """0 where one of the shares is below its limits, 1 where both are above them."""
+    return float(_between(own, limits[0]) * _between(before, limits[1]))
+
+
+@compiled
+def _between(share: float, limits: tuple[float, float]) -> float:
+    """0 below the first limit, 1 above the second, straight between."""
+    return float(min(max((share - limits[0]) / (limits[1] - limits[0]), 0.0), 1.0))
