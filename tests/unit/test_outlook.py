@@ -15,7 +15,7 @@ from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import AREA_REACH_M, ZONES_M, Floats, Network
+from utn_sumo.contract import AREA_REACH_M, EXIT, ZONES_M, Floats, Network
 
 BIN_S, BINS = 2.0, 25
 A_BIN = 1.0
@@ -186,7 +186,7 @@ def test_nobody_is_expected_any_more_once_they_have_stopped_coming(utn17: Networ
 
 def test_whom_a_neighbour_sends_arrives_after_the_way_along_the_link(utn17: Network) -> None:
     streams = Streams(utn17)
-    for stream in np.flatnonzero(streams.feeds):
+    for stream in np.flatnonzero(streams.next_link != EXIT):
         outlook = Outlook(utn17, streams, BINS, BIN_S)
         link, place = streams.next_link[stream], 4
         outlook.sent_veh[stream, place] = 3.0
@@ -204,7 +204,7 @@ def test_whom_a_neighbour_sends_arrives_after_the_way_along_the_link(utn17: Netw
 def test_who_comes_as_neighbours_said_is_not_expected_from_elsewhere_as_well(utn17: Network) -> None:
     gap_s = 4.0
     streams = Streams(utn17)
-    stream = int(np.flatnonzero(streams.feeds)[0])
+    stream = int(np.flatnonzero(streams.next_link != EXIT)[0])
     road = Road(utn17, int(streams.next_link[stream]), np.arange(0.5, 900, gap_s))
     for _ in range(400):
         road.outlook.sent_veh[stream] = BIN_S / gap_s

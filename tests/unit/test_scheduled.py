@@ -399,7 +399,6 @@ class TestStreams:
         )
         assert (same.sum(axis=1) == 1).all()
         assert same.any(axis=0).all()
-        assert (streams.feeds == (streams.next_link != EXIT)).all()
         of_link, of_group = streams.shares(fraction)
         assert of_link == pytest.approx(same.T.astype(float) @ fraction[turns])
         links = np.bincount(network.turn_link[turns], fraction[turns], len(network.links))
@@ -551,7 +550,7 @@ class TestExecution:
 
     def test_nobody_is_sent_onto_a_link_that_is_full(self, utn17: Network) -> None:
         streams = Streams(utn17)
-        stream = int(np.flatnonzero(streams.feeds)[0])
+        stream = int(np.flatnonzero(streams.next_link != EXIT)[0])
         ahead = int(streams.next_link[stream])
         execution = Scheduled(utn17)
         for taken, moves in ((0.0, True), (0.9, False)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_sumo.contract import EXIT, Floats, Network
+from utn_sumo.contract import Floats, Network
 
 
 class Streams:
@@ -41,8 +41,6 @@ class Streams:
         """(N,)"""
         self.next_link = network.turn_next[one]
         """(N,) link that each feeds, or EXIT."""
-        self.feeds = self.next_link != EXIT
-        """(N,)"""
         self.first = np.searchsorted(turn_junction[one], np.arange(len(network.junctions) + 1))
         """(J + 1,) where the junctions' streams begin."""
         self.serves = network.serves[np.ix_(self.stage, one)]
