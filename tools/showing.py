@@ -100,9 +100,9 @@ def draw(rows: Sequence[Figures], folder: Path) -> list[Path]:
         demands = sorted({row["demand"] for row in own})
         if not own:
             continue
-        # Side by side where they would hide each other.
+        # Side by side where they would hide each other, but by so little that steep lines don't seem to cross.
         span = demands[-1] - demands[0] or 0.2
-        apart = min(0.7 * min(np.diff(demands), default=span) / len(names), 0.012 * span)
+        apart = min(0.7 * min(np.diff(demands), default=span) / len(names), 0.004 * span)
         aside = max(0.08 * span, 0.6 * apart * len(names))
         figure, axes = plt.subplots(figsize=(10.5, 5.6), layout="constrained")
         for index, name in enumerate(names):
