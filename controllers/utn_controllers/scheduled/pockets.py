@@ -17,8 +17,8 @@ between which the queues on both come to hold others up."""
 SHUT = (0.4, 0.9), (0.1, 0.4)
 """The same shares, between which fewer and fewer get past such a queue into the other lanes.
 
-One sharp limit would have what is worth most change from one decision to the next, and a pocket's stage put off again
-and again.
+Limits that are one number each would have what is worth most change from one decision to the next, and a pocket's
+stage put off again and again.
 """
 
 

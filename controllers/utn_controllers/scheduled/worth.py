@@ -19,7 +19,6 @@ LASTING_S = 100.0
 """Over what time queues are taken that hold up those behind them: within a cycle all come and go."""
 DENSE = 0.3
 """Share of the room in sight from which on, over that time, a queue holds up who is behind it."""
-
 STARVED_S = 120.0
 """Who has not been let go to the last one for so long weighs more by all of `starving`."""
 
