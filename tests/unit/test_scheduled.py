@@ -18,7 +18,7 @@ from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.moves import Moves, Rules
-from utn_controllers.scheduled.programme import schedules
+from utn_controllers.scheduled.programme import STAYING_BINS, schedules
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, Floats, Ints, Network
 from utn_sumo.estimation import Estimator
@@ -144,6 +144,7 @@ def waited(shown: list[int], stand: list[float], come: list[list[float]], worth:
         for stage, arriving in zip(shown, come[stream], strict=True):
             queue = max(queue + arriving - (most if stage == stream else 0.0), 0.0)
             total += worth[stream] * queue
+        total += STAYING_BINS * worth[stream] * queue
     return total
 
 
@@ -154,7 +155,8 @@ def a_bin(green: Floats, place: int, queue: Floats, drawn: Drawn) -> tuple[float
     """What is waited in a bin of which streams have the share `green`; the queues."""
     _, _, come, worth, most = drawn
     queue = np.maximum(queue + np.array(come)[:, place] - green * most, 0.0)
-    return float(np.array(worth) @ queue), queue
+    bins = 1 + STAYING_BINS * (place == len(come[0]) - 1)
+    return bins * float(np.array(worth) @ queue), queue
 
 
 def plainly(drawn: Drawn, rest: int) -> tuple[set[int], float]:
@@ -229,7 +231,7 @@ class TestProgramme:
         best = min(cost for cost, _ in every)
         begun_so = min(cost for cost, shown in every if (shown[0] == 0) == (wish == 0))
         left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
-        planned = float(np.array(worth) @ left_veh.sum(axis=1))
+        planned = float(np.array(worth) @ (left_veh.sum(axis=1) + STAYING_BINS * left_veh[:, -1]))
         assert best - 1e-6 <= planned <= NEAR_ENOUGH * best + 1e-6
         assert begun_so <= NEAR_ENOUGH * best + 1e-6
 
@@ -273,7 +275,7 @@ class TestProgramme:
         wish, sent = crossing.decide(stand, np.array(come), rest=rest, worth=worth, most=most)
         found, cost = plainly(drawn, rest)
         left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
-        planned = float(np.array(worth) @ left_veh.sum(axis=1))
+        planned = float(np.array(worth) @ (left_veh.sum(axis=1) + STAYING_BINS * left_veh[:, -1]))
         assert wish in found
         assert planned == pytest.approx(cost, abs=1e-6)
 

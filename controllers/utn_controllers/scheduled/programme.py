@@ -20,6 +20,8 @@ NEVER = 1e18
 """Cost of what can't be reached."""
 SOME_VEH = 1e-3
 """Fewer than so many are nobody."""
+STAYING_BINS = 5
+"""Who is still there at the end waits so much longer: else what a change of stages costs later would cost nothing."""
 ALIKE = 1e-9
 """Costs that differ by no more are the same: of ways alike the one found first is kept, whatever the rounding."""
 
@@ -162,7 +164,8 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     leaves = moves[low + stage, stream] * most[stream]
                     veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
                     moving += worth[stream] * veh[stream]
-                spent, now = spent + moving, now + 1
+                now += 1
+                spent += moving * (1 + STAYING_BINS * (now == bins))
             if now == bins and spent < best - ALIKE:
                 best, last_begin, last_stage = spent, begin, stage
     for stage in range(stages):
@@ -188,13 +191,15 @@ def _sums(serves: Floats, stand: Floats, come: Floats, worth: Floats, most: Floa
     for stage in range(stages + 1):
         for place in range(bins):
             paid[stage, place + 1] = paid[stage, place] + grown[stage, place + 1]
+        paid[stage, bins] += STAYING_BINS * grown[stage, bins]
     return Traffic(stand, come, came, grown, paid, worth, most)
 
 
 @compiled
 def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weight: float) -> float:
     """What those wait in some bins who have red in a stage, and of whom so much stood before."""
-    return float(paid[stage, until] - paid[stage, since] + (until - since) * (weight - grown[stage, since]))
+    over = until - since + STAYING_BINS * (until > since and until == grown.shape[1] - 1)
+    return float(paid[stage, until] - paid[stage, since] + over * (weight - grown[stage, since]))
 
 
 @compiled
@@ -214,7 +219,7 @@ def _won(row: int, begin: int, stage: int, end: int, until: int, veh: Floats, mo
             share = moves[row + place - end, stream]
             if share > 0:
                 queue = max(queue - share * traffic.most[stream], 0.0)
-            less += red - queue
+            less += (red - queue) * (1 + STAYING_BINS * (place == len(traffic.come[stream]) - 1))
         won += traffic.worth[stream] * less
     return won
 
@@ -261,6 +266,7 @@ def _waited(plan: Ints, moves: Floats, traffic: Traffic) -> float:
             if share > 0:
                 veh = max(veh - share * traffic.most[stream], 0.0)
             waited += veh
+        waited += STAYING_BINS * veh
         total += traffic.worth[stream] * waited
     return total
 
