@@ -19,7 +19,7 @@ class Traffic(NamedTuple):
     grown: Floats
     """(s + 1, K + 1) sum of what those weigh who have come and have red in a stage; in the last row, of all."""
     paid: Floats
-    """(s + 1, K + 1) sum of what they have waited, if nobody had stood before."""
+    """(s + 1, K + 1) sum of what they have waited, if nobody had stood before; in the last column, and will."""
     worth: Floats
     """(n,) weight of a vehicle."""
     most: Floats
