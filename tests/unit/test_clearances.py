@@ -87,6 +87,16 @@ def test_who_waits_too_long_comes_next_and_who_does_not_wait_does_not(utn17: Net
         assert (kept != now.stage).all() == forced
 
 
+def test_who_creeps_on_for_a_moment_waits_still_and_who_has_gone_does_not(utn17: Network) -> None:
+    for unseen_s, forced in ((LOOK_S, True), (2 * LOOK_S, False)):
+        heads = Heads(utn17, lambda index, state: None)
+        for time_s in np.arange(0, MOST_PATIENCE_S + LOOK_S, LOOK_S):
+            stands = not 60 <= time_s < 60 + unseen_s
+            now = scene(utn17, float(time_s), veh=float(stands))
+            kept = heads.patient(now.stage, now)
+        assert (kept != now.stage).all() == forced
+
+
 def test_who_has_had_green_in_one_stage_does_not_call_for_another(utn17: Network) -> None:
     first, second, last = utn17.junctions[0].stages
     both = replace(utn17.stages[last], turns=(*utn17.stages[last].turns, *utn17.stages[second].turns))

@@ -19,6 +19,9 @@ from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network, Plan, State
 
 BIN_S = 2
 """Length of a bin, and time between two decisions."""
+FINE_BINS, COARSE_BINS = 10, 2
+"""So many bins ahead a green may end before any of them; later before every second one of the clock, so that what was
+planned stays among what may be as it comes nearer. It is chosen anew until then."""
 
 
 class ScheduledSettings(BaseModel):
@@ -76,6 +79,7 @@ class Scheduled:
             self._streams.first,
             self._orders(),
             moves.share,
+            moves.going,
             moves.row,
             moves.bins,
             np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
@@ -84,6 +88,9 @@ class Scheduled:
         """(J, K) the last schedules."""
         self._row = np.argsort(stages)
         """(S,) row of the rules in which each of the network's stages is."""
+        ahead = np.arange(bins)
+        self._ends = [(ahead < FINE_BINS) | ((ahead + clock) % COARSE_BINS == 0) for clock in range(COARSE_BINS)]
+        """(K,) by the clock: before which bins a green may end."""
         self._endless = np.full(len(network.junctions), bins)
         self._green_s: Floats | None = None
         self._take_up()
@@ -122,6 +129,7 @@ class Scheduled:
                 most,
                 self._plan,
                 outlook.sent_veh,
+                self._ends[round(view.time_s / BIN_S) % COARSE_BINS],
             )
         )
 

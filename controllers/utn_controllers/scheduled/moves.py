@@ -32,6 +32,8 @@ class Rules(NamedTuple):
     """(S, most stages of a junction) whether its junction's nth may come after a stage."""
     moves: Floats
     """(R, most streams of a junction) share of its discharge that each has."""
+    going: Ints
+    """(R, most streams of a junction + 1) those that move in a stage, or in the clearance that begins in a row; -1."""
     clearing: Ints
     """(S, most stages of a junction) row of the first bin of the clearance to its junction's nth, -1 if all is red."""
     clearance: Ints
@@ -71,6 +73,14 @@ class Moves:
         """(R, most streams of a junction)."""
         for number, row in enumerate(rows):
             self.share[number, : len(row)] = row
+        self.going = np.full((len(rows), self.share.shape[1] + 1), -1)
+        """(R, most streams of a junction + 1) those that move in a stage, or in the clearance that begins in a row,
+        before as many -1 as have room."""
+        lasting = [*zip(self.row.ravel(), self.bins.ravel(), strict=True), *((row, 1) for row in range(len(owner)))]
+        for row, bins in lasting:
+            if row >= 0:
+                going = np.flatnonzero(self.share[row : row + bins].any(axis=0))
+                self.going[row, : len(going)] = going
 
 
 def _shares(phases: Phases, letters: list[tuple[int, ...]], bin_s: int) -> Floats:

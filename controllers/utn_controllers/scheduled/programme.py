@@ -18,7 +18,7 @@ from utn_sumo.contract import Bools, Floats, Ints
 
 NEVER = 1e18
 """Cost of what can't be reached."""
-SOME_VEH = 1e-3
+SOME_VEH = 0.02
 """Fewer than so many are nobody."""
 STAYING_BINS = 5
 """Who is still there at the end waits so much longer: else what a change of stages costs later would cost nothing."""
@@ -29,12 +29,14 @@ ALIKE = 1e-9
 @compiled
 def schedules(
     stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats,
-    most: Floats, plan: Ints, sent: Floats,
+    most: Floats, plan: Ints, sent: Floats, ends: Bools,
 ) -> Ints:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
     `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
     weight of a vehicle, `most` (N,) that leave in a bin of green.
+
+    `ends` (K,) bins before which a green may end, whether any may.
 
     `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
@@ -53,7 +55,7 @@ def schedules(
         stages = rules.first_stage[junction + 1] - low
         chosen = _schedule(
             present, rest[junction], low, stages, rules, stand[a:b], come[a:b], worth[a:b], most[a:b],
-            plan[junction], sent[a:b],
+            plan[junction], sent[a:b], ends,
         )  # fmt: skip
         wish[junction] = rules.stages[low + chosen]
     return wish
@@ -62,7 +64,7 @@ def schedules(
 @compiled
 def _schedule(
     present: int, rest: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats,
-    worth: Floats, most: Floats, plan: Ints, sent: Floats,
+    worth: Floats, most: Floats, plan: Ints, sent: Floats, ends: Bools,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on."""
     chosen = present
@@ -72,7 +74,7 @@ def _schedule(
         # What was best a bin ago is seldom far from what is best now.
         known = _waited(plan, rules.moves, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
-            chosen = _search(present, rest, low, called, rules, traffic, limit, plan)
+            chosen = _search(present, rest, low, called, rules, traffic, limit, plan, ends)
             if chosen >= 0:
                 break
     else:
@@ -101,11 +103,13 @@ def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, co
 
 @compiled
 def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for the compiler
-    present: int, rest: int, low: int, called: Bools, rules: Rules, traffic: Traffic, limit: float, plan: Ints
-) -> int:
+    present: int, rest: int, low: int, called: Bools, rules: Rules, traffic: Traffic, limit: float, plan: Ints,
+    ends: Bools,
+) -> int:  # fmt: skip
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
-    moves, clearance, least = rules.moves, rules.clearance, rules.least
+    moves, going, clearing, clearance = rules.moves, rules.going, rules.clearing, rules.clearance
+    came, least = traffic.came, rules.least
     (streams, bins), stages = come.shape, len(called)
     # The state: the stage that begins and when; for each the least cost until then, the queues, and whence.
     cost = np.full((bins + 1, stages), NEVER)
@@ -116,39 +120,51 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     queue[0, present] = traffic.stand
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
     after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
-    green, veh = np.empty(streams, np.int64), np.empty(streams)
+    others, veh = np.empty(stages, np.int64), np.empty(streams)
     for begin in range(bins):
         for stage in range(stages):
             spent = cost[begin, stage]
             if spent >= best - ALIKE:
                 continue
+            row = low + stage
             if begin > 0:
-                _lead(begin, stage, low, whence, rules, traffic, queue)
+                before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
+                _lead(
+                    before, end, begin, low + was, clearing[low + was, stage], moves, going, come, came, most,
+                    queue[before, was], queue[begin, stage],
+                )  # fmt: skip
             # What the queues weigh that move, and that have red: these in `veh` as they stood when it began.
-            greens, moving, held = 0, 0.0, 0.0
+            moving, held = 0.0, 0.0
             for stream in range(streams):
                 veh[stream] = queue[begin, stage, stream]
-                weight = worth[stream] * veh[stream]
-                if moves[low + stage, stream] > 0:
-                    green[greens], greens = stream, greens + 1
-                    moving += weight
-                else:
-                    held += weight
-            may_end, must_end = (begin + least[low + stage], bins) if begin > 0 else (0, rest)
+                held += worth[stream] * veh[stream]
+            greens = 0
+            while going[row, greens] >= 0:
+                stream = going[row, greens]
+                moving += worth[stream] * veh[stream]
+                greens += 1
+            held -= moving
+            nexts = 0
+            for other in range(stages):
+                if after[stage, other]:
+                    others[nexts], nexts = other, nexts + 1
+            may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
             now = begin
             while now < bins and spent < best - ALIKE:
-                if now >= may_end:
+                if now >= must_end or (now >= may_end and ends[now]):
                     # It ends here: others begin after their clearance, where that is the best way there.
                     won, won_in = 0.0, -1
-                    for other in range(stages):
-                        opens = min(now + clearance[low + stage, other], bins)
-                        if not after[stage, other] or spent >= cost[opens, other] - ALIKE:
+                    for place in range(nexts):
+                        other = others[place]
+                        opens = min(now + clearance[row, other], bins)
+                        if spent >= cost[opens, other] - ALIKE:
                             continue
                         until = spent + _held(stages, grown, paid, now, opens, held + moving)
-                        row = rules.clearing[low + stage, other]
-                        if row not in (-1, won_in):
-                            won_in, won = row, _won(row, begin, low + stage, now, opens, veh, moves, traffic)
-                        until -= won if row >= 0 else 0.0
+                        if clearing[row, other] >= 0:
+                            if clearing[row, other] != won_in:
+                                won_in = clearing[row, other]
+                                won = _won(won_in, begin, row, now, opens, veh, moves, going, come, came, worth, most)
+                            until -= won
                         if until < cost[opens, other] - ALIKE:
                             cost[opens, other] = until
                             whence[opens, other, 0] = begin
@@ -160,8 +176,8 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 held += grown[stage, now + 1] - grown[stage, now]
                 moving = 0.0
                 for place in range(greens):
-                    stream = green[place]
-                    leaves = moves[low + stage, stream] * most[stream]
+                    stream = going[row, place]
+                    leaves = moves[row, stream] * most[stream]
                     veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
                     moving += worth[stream] * veh[stream]
                 now += 1
@@ -203,55 +219,51 @@ def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weigh
 
 
 @compiled
-def _won(row: int, begin: int, stage: int, end: int, until: int, veh: Floats, moves: Floats, traffic: Traffic) -> float:
-    """What is waited less in a clearance than if all had red; `veh` of who had red already as the `stage` began."""
-    won = 0.0
-    for stream in range(len(veh)):
-        if not _goes(moves, row, until - end, stream):
-            continue
+def _won(
+    clearing: int, begin: int, row: int, end: int, until: int, veh: Floats, moves: Floats, going: Ints, come: Floats,
+    came: Floats, worth: Floats, most: Floats,
+) -> float:  # fmt: skip
+    """What is waited less in a clearance than if all had red; `veh` of who had red already as the stage began."""
+    won, place = 0.0, 0
+    while going[clearing, place] >= 0:
+        stream = going[clearing, place]
         queue = veh[stream]
-        if moves[stage, stream] == 0:
-            queue += traffic.came[stream, end] - traffic.came[stream, begin]
+        if moves[row, stream] == 0:
+            queue += came[stream, end] - came[stream, begin]
         red, less = queue, 0.0
-        for place in range(end, until):
-            red += traffic.come[stream, place]
-            queue += traffic.come[stream, place]
-            share = moves[row + place - end, stream]
-            if share > 0:
-                queue = max(queue - share * traffic.most[stream], 0.0)
-            less += (red - queue) * (1 + STAYING_BINS * (place == len(traffic.come[stream]) - 1))
-        won += traffic.worth[stream] * less
+        for now in range(end, until):
+            red += come[stream, now]
+            queue = max(queue + come[stream, now] - moves[clearing + now - end, stream] * most[stream], 0.0)
+            less += (red - queue) * (1 + STAYING_BINS * (now == come.shape[1] - 1))
+        won += worth[stream] * less
+        place += 1
     return won
 
 
 @compiled
-def _goes(moves: Floats, row: int, bins: int, stream: int) -> bool:
-    """Whether a stream has green in any bin of a clearance."""
-    share = 0.0
-    for place in range(row, row + bins):
-        share += moves[place, stream]
-    return share > 0
-
-
-@compiled
-def _lead(begin: int, stage: int, low: int, whence: Ints, rules: Rules, traffic: Traffic, queue: Floats) -> None:
-    """Fills in the queues when a stage begins, by those when the stage before it did."""
-    before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
-    row = rules.clearing[low + was, stage]
-    for stream in range(len(traffic.most)):
-        veh, since = queue[before, was, stream], before
-        share = rules.moves[low + was, stream]
-        if share > 0:
-            for place in range(before, end):
-                veh = max(veh + traffic.come[stream, place] - share * traffic.most[stream], 0.0)
-            since = end
-        if row >= 0 and _goes(rules.moves, row, begin - end, stream):
-            veh += traffic.came[stream, end] - traffic.came[stream, since]
-            for place in range(end, begin):
-                leaves = rules.moves[row + place - end, stream] * traffic.most[stream]
-                veh = max(veh + traffic.come[stream, place] - leaves, 0.0)
-            since = begin
-        queue[begin, stage, stream] = veh + traffic.came[stream, begin] - traffic.came[stream, since]
+def _lead(
+    before: int, end: int, begin: int, row: int, clearing: int, moves: Floats, going: Ints, come: Floats,
+    came: Floats, most: Floats, was: Floats, veh: Floats,
+) -> None:  # fmt: skip
+    """Fills in the queues `veh` when a stage begins, by those that there were when the stage `before` it did."""
+    for stream in range(len(veh)):
+        veh[stream] = was[stream] + came[stream, begin] - came[stream, before]
+    place = 0
+    while going[row, place] >= 0:
+        stream = going[row, place]
+        veh[stream] = was[stream]
+        for now in range(before, end):
+            veh[stream] = max(veh[stream] + come[stream, now] - moves[row, stream] * most[stream], 0.0)
+        veh[stream] += came[stream, begin] - came[stream, end]
+        place += 1
+    place = 0
+    while clearing >= 0 and going[clearing, place] >= 0:
+        stream = going[clearing, place]
+        veh[stream] -= came[stream, begin] - came[stream, end]
+        for now in range(end, begin):
+            leaves = moves[clearing + now - end, stream] * most[stream]
+            veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
+        place += 1
 
 
 @compiled

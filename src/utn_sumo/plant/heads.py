@@ -42,6 +42,8 @@ class Heads:
         self._patience_s = np.where(self._needs, _patience_s(network)[:, None], np.inf).min(axis=0)
         self._since_s = np.zeros(self._needs.shape[1])
         """(M + walks,) since when somebody has been waiting for each, without green meanwhile."""
+        self._stood = np.zeros(self._needs.shape[1], dtype=np.bool_)
+        """(M + walks,) whether somebody stood before each at the last look: who creeps on for a moment waits still."""
         self._look_s = 0.0
         """When it is looked again who waits."""
         self._overdue: list[int] = []
@@ -90,6 +92,7 @@ class Heads:
         waits = np.ones(len(self._since_s), dtype=np.bool_)
         # Pedestrians, whom no detector sees, may always be waiting.
         waits[: len(turn_group)] = view.waiting_veh[turn_group] > 0
+        self._stood, waits = waits, waits | self._stood
         waits &= ~self._needs[present, np.arange(len(waits))]
         self._since_s[~waits] = view.time_s
         late = np.flatnonzero(self._since_s + self._patience_s <= view.time_s)
