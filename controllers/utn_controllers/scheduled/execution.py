@@ -19,9 +19,10 @@ from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network, Plan, State
 
 BIN_S = 2
 """Length of a bin, and time between two decisions."""
-FINE_BINS, COARSE_BINS = 10, 2
+FINE_BINS, COARSE_BINS = 14, 2
 """So many bins ahead a green may end before any of them; later before every second one of the clock, so that what was
-planned stays among what may be as it comes nearer. It is chosen anew until then."""
+planned stays among what may be as it comes nearer. It is chosen anew until then. Where clearances are as long as those
+of people who walk, less than 14 cost 6 % in light traffic."""
 
 
 class ScheduledSettings(BaseModel):
