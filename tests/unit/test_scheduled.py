@@ -20,7 +20,7 @@ from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.programme import STAYING_BINS, schedules
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
+from utn_sumo.contract import EXIT, Floats, Ints, Network
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.heads import Heads
 
@@ -91,7 +91,6 @@ class Crossing:
         free: bool = True,
         plan: Ints | None = None,
         sent: Floats | None = None,
-        ends: Bools | None = None,
     ) -> tuple[int, Floats]:
         """The stage led to, and (N, K) what is sent off; `plan` (K,) is the schedule of the bin before."""
         stages = len(self.clearance)
@@ -108,7 +107,6 @@ class Crossing:
             np.zeros(stages) + np.array(most, dtype=float),
             plan[None].copy(),
             sent,
-            np.ones(self.bins, dtype=np.bool_) if ends is None else ends,
         )
         return int(wish[0]), sent
 
@@ -257,24 +255,6 @@ class TestProgramme:
         assert (np.cumsum(sent, axis=1) <= np.array(stand)[:, None] + np.cumsum(come, axis=1) + 1e-9).all()
         # Never two that cross in one bin.
         assert (np.minimum(sent[0], sent[1]) <= 1e-9).all()
-
-    @given(drawn=junctions(), stage=st.integers(0, 1), rest=st.integers(1, 10), ends=st.data())
-    def test_where_no_green_may_end_now_it_goes_on_unless_it_must_end(
-        self, drawn: Drawn, stage: int, rest: int, ends: st.DataObject
-    ) -> None:
-        crossing, stand, come, worth, most = drawn
-        chosen = {"stage": stage, "rest": rest, "worth": worth, "most": most}
-        may_end = np.array(
-            [False, *ends.draw(st.lists(st.booleans(), min_size=crossing.bins - 1, max_size=crossing.bins - 1))]
-        )
-        wish, _ = crossing.decide(stand, np.array(come), ends=may_end, **chosen)
-        assert wish == stage
-        # The green must end after `rest` bins all the same.
-        held, _ = crossing.decide(
-            stand, np.array(come), ends=np.zeros(crossing.bins, dtype=np.bool_), **{**chosen, "rest": 0}
-        )
-        free, _ = crossing.decide(stand, np.array(come), **{**chosen, "rest": 0})
-        assert (held == stage) == (free == stage)
 
     @given(drawn=holding(), stage=st.integers(0, 1), rest=st.integers(0, 10), data=st.data())
     def test_whatever_the_last_schedule_was_the_next_is_the_same(

@@ -19,10 +19,6 @@ from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network, Plan, State
 
 BIN_S = 2
 """Length of a bin, and time between two decisions."""
-FINE_BINS, COARSE_BINS = 14, 2
-"""So many bins ahead a green may end before any of them; later before every second one of the clock, so that what was
-planned stays among what may be as it comes nearer. It is chosen anew until then. Where clearances are as long as those
-of people who walk, less than 14 cost 6 % in light traffic."""
 
 
 class ScheduledSettings(BaseModel):
@@ -89,9 +85,6 @@ class Scheduled:
         """(J, K) the last schedules."""
         self._row = np.argsort(stages)
         """(S,) row of the rules in which each of the network's stages is."""
-        ahead = np.arange(bins)
-        self._ends = [(ahead < FINE_BINS) | ((ahead + clock) % COARSE_BINS == 0) for clock in range(COARSE_BINS)]
-        """(K,) by the clock: before which bins a green may end."""
         self._endless = np.full(len(network.junctions), bins)
         self._green_s: Floats | None = None
         self._take_up()
@@ -130,7 +123,6 @@ class Scheduled:
                 most,
                 self._plan,
                 outlook.sent_veh,
-                self._ends[round(view.time_s / BIN_S) % COARSE_BINS],
             )
         )
 

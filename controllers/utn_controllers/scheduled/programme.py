@@ -29,14 +29,12 @@ ALIKE = 1e-9
 @compiled
 def schedules(
     stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats,
-    most: Floats, plan: Ints, sent: Floats, ends: Bools,
+    most: Floats, plan: Ints, sent: Floats,
 ) -> Ints:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
     `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
     weight of a vehicle, `most` (N,) that leave in a bin of green.
-
-    `ends` (K,) bins before which a green may end, whether any may.
 
     `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
@@ -55,7 +53,7 @@ def schedules(
         stages = rules.first_stage[junction + 1] - low
         chosen = _schedule(
             present, rest[junction], low, stages, rules, stand[a:b], come[a:b], worth[a:b], most[a:b],
-            plan[junction], sent[a:b], ends,
+            plan[junction], sent[a:b],
         )  # fmt: skip
         wish[junction] = rules.stages[low + chosen]
     return wish
@@ -64,7 +62,7 @@ def schedules(
 @compiled
 def _schedule(
     present: int, rest: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats,
-    worth: Floats, most: Floats, plan: Ints, sent: Floats, ends: Bools,
+    worth: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on."""
     chosen = present
@@ -74,7 +72,7 @@ def _schedule(
         # What was best a bin ago is seldom far from what is best now.
         known = _waited(plan, rules.moves, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
-            chosen = _search(present, rest, low, called, rules, traffic, limit, plan, ends)
+            chosen = _search(present, rest, low, called, rules, traffic, limit, plan)
             if chosen >= 0:
                 break
     else:
@@ -103,9 +101,8 @@ def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, co
 
 @compiled
 def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for the compiler
-    present: int, rest: int, low: int, called: Bools, rules: Rules, traffic: Traffic, limit: float, plan: Ints,
-    ends: Bools,
-) -> int:  # fmt: skip
+    present: int, rest: int, low: int, called: Bools, rules: Rules, traffic: Traffic, limit: float, plan: Ints
+) -> int:
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
     moves, going, clearing, clearance = rules.moves, rules.going, rules.clearing, rules.clearance
@@ -151,7 +148,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
             may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
             now = begin
             while now < bins and spent < best - ALIKE:
-                if now >= must_end or (now >= may_end and ends[now]):
+                if now >= may_end:
                     # It ends here: others begin after their clearance, where that is the best way there.
                     won, won_in = 0.0, -1
                     for place in range(nexts):
