@@ -17,7 +17,7 @@ from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
 from utn_controllers.scheduled.execution import Scheduled
-from utn_controllers.scheduled.moves import Moves, Rules
+from utn_controllers.scheduled.moves import Moves, Rules, going
 from utn_controllers.scheduled.programme import STAYING_BINS, schedules
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, Floats, Ints, Network
@@ -71,13 +71,8 @@ class Crossing:
                 clearing[stage, other] = len(moves)
                 moves = np.vstack([moves, shares])
         first = np.array([0, stages])
-        going = np.full((len(moves), stages + 1), -1)
-        begin_last = [(row, row + 1) for row in range(stages)]
-        begin_last += [(row, row + bins) for row, bins in zip(clearing.flat, clearance.flat, strict=True) if row >= 0]
-        for row, last in begin_last:
-            streams = np.flatnonzero(moves[row:last].any(axis=0))
-            going[row, : len(streams)] = streams
-        return Rules(place, first, first, follows, moves, going, clearing, clearance, np.array(self.least))
+        who = going(moves, stages, clearing, clearance)
+        return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least))
 
     def decide(
         self,

@@ -33,7 +33,8 @@ class Rules(NamedTuple):
     moves: Floats
     """(R, most streams of a junction) share of its discharge that each has."""
     going: Ints
-    """(R, most streams of a junction + 1) those that move in a stage, or in the clearance that begins in a row; -1."""
+    """(R, most streams of a junction + 1) those that move in a stage, or in the clearance that begins in a row, then
+    -1."""
     clearing: Ints
     """(S, most stages of a junction) row of the first bin of the clearance to its junction's nth, -1 if all is red."""
     clearance: Ints
@@ -73,14 +74,23 @@ class Moves:
         """(R, most streams of a junction)."""
         for number, row in enumerate(rows):
             self.share[number, : len(row)] = row
-        self.going = np.full((len(rows), self.share.shape[1] + 1), -1)
-        """(R, most streams of a junction + 1) those that move in a stage, or in the clearance that begins in a row,
-        before as many -1 as have room."""
-        lasting = [*zip(self.row.ravel(), self.bins.ravel(), strict=True), *((row, 1) for row in range(len(owner)))]
-        for row, bins in lasting:
-            if row >= 0:
-                going = np.flatnonzero(self.share[row : row + bins].any(axis=0))
-                self.going[row, : len(going)] = going
+        self.going = going(self.share, len(owner), self.row, self.bins)
+        """(R, most streams of a junction + 1) as in `Rules`."""
+
+
+def going(share: Floats, stages: int, row: Ints, bins: Ints) -> Ints:
+    """(R, most streams + 1) `Rules.going`, by who moves in each row (R, most streams), of which first are the stages'.
+
+    `row` and `bins` (S, most stages) are those of the clearances.
+    """
+    who = np.full((len(share), share.shape[1] + 1), -1)
+    cleared = row >= 0
+    begin = np.append(np.arange(stages), row[cleared])
+    end = begin + np.append(np.ones(stages, dtype=np.int64), bins[cleared])
+    for first, last in zip(begin, end, strict=True):
+        streams = np.flatnonzero(share[first:last].any(axis=0))
+        who[first, : len(streams)] = streams
+    return who
 
 
 def _shares(phases: Phases, letters: list[tuple[int, ...]], bin_s: int) -> Floats:
