@@ -11,6 +11,7 @@ import pytest
 
 from utn_sumo import bridge, monitor
 from utn_sumo.contract import Network
+from utn_sumo.plant import inside
 from utn_sumo.scenario import scenario
 
 from . import odd_nets
@@ -79,3 +80,41 @@ def test_it_runs_odd_nets_safely(make: Callable[[Path], Path], tmp_path: Path) -
     result = bridge.run(scenario(net=str(make(tmp_path)), controller="recommended", seed=5), tmp_path / "run")
     assert_safe(result)
     assert result["arrived"] > 0
+
+
+def wide_crossing(folder: Path) -> Path:
+    """A skew crossing with a lane for every turn, arrows for left turns, no red for all, and long vehicles."""
+    streets = odd_nets.Streets()
+    streets.node("C", 0, 0, "traffic_light", radius=12)
+    places = {"N": (-14, 200), "E": (200, 14), "S": (14, -200), "W": (-200, -14)}
+    arms = list(places)
+    types = ((20, 5.0), (2, 12.5), (1, 16.25))
+    said = "".join(f'<vType id="{length_m}" length="{length_m}" probability="{share}"/>' for share, length_m in types)
+    routes = f'<vTypeDistribution id="DEFAULT_VEHTYPE">{said}</vTypeDistribution>'
+    for place, arm in enumerate(arms):
+        left, ahead, right = (arms[(place + step) % 4] for step in (1, 2, 3))
+        main = arm in "WE"
+        streets.node(arm, *places[arm])
+        streets.one_way(arm, "C", 3 if main else 2)
+        streets.one_way("C", arm)
+        ways = ((right, 0, 143), (ahead, int(main), 520 if main else 416), (left, 1 + main, 156 if main else 143))
+        for to, lane, flow_veh_h in ways:
+            streets.connection(f"{arm}-C", f"C-{to}", fromLane=lane, toLane=0)
+            routes += odd_nets.flow(f"{arm}{to}", f"{arm}-C", f"C-{to}", vehsPerHour=flow_veh_h, end=1800)
+    streets.net(folder, odd_nets.NO_TURNAROUNDS, "--tls.left-green.time", "6")
+    return odd_nets.case(folder, routes, end="1800")
+
+
+@pytest.mark.long
+def test_who_waits_amid_a_junction_is_let_out_before_the_next_road_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    delay_s = []
+    for looks in (10**9, inside.UNUSED_LOOKS):
+        monkeypatch.setattr(inside, "UNUSED_LOOKS", looks)
+        folder = tmp_path / str(looks)
+        folder.mkdir()
+        result = bridge.run(scenario(net=str(wide_crossing(folder)), controller="recommended", seed=4), folder / "run")
+        assert_safe(result)
+        delay_s.append(result["mean_delay_s"])
+    assert delay_s[1] < 0.7 * delay_s[0]

@@ -97,6 +97,11 @@ class Eyes:
         veh = float(sum(map(self._present, own)))
         return veh + float(self._share[group]) * sum(map(self._present, before)) if before else veh
 
+    def left_one_veh(self, group: int, time_s: float) -> float:
+        """That have left over the stop line of one lane group since the run began."""
+        counted = 0 if time_s % self._step_s == 0 else sum(map(self._counted, self._group_stop_line[group]))
+        return float(self._left_veh[group]) + counted
+
     def gap_one_s(self, group: int) -> float:
         """Since a vehicle was last on the stop-line loops of one lane group."""
         return float(min(map(self._since_s, self._group_stop_line[group])))

@@ -11,6 +11,7 @@ import numpy as np
 from utn_sumo import clearances
 from utn_sumo.clearances import Phases, Times
 from utn_sumo.contract import Bools, Floats, Ints, Network, View
+from utn_sumo.plant.inside import MOST_HOLD_S, Inside, Loops
 
 MOST_PATIENCE_S = 150.0
 """Who has waited so long without green is served next, whatever is wished."""
@@ -18,15 +19,18 @@ LONGEST_RED_S = 180.0
 """Where least greens and clearances are long it comes next sooner: nobody is to wait longer than this."""
 LOOK_S = 5.0
 """Time between two looks at who waits."""
+HOLD_S = 1.0
+"""By which a stage begins later as long as somebody is amid the junction."""
 
 
 class Heads:
     """The signals of a network: the stage of each junction, or the clearance on the way to it."""
 
-    def __init__(self, network: Network, show: Callable[[int, str], None]):
-        """`show` puts letters on the signals of a junction."""
+    def __init__(self, network: Network, show: Callable[[int, str], None], loops: Loops | None = None):
+        """`show` puts letters on the signals of a junction; without `loops` nobody is waited for amid it."""
         self.network = network
         self._show = show
+        self._inside = None if loops is None else Inside(network, loops)
         self.stage: Ints = np.array([junction.stages[0] for junction in network.junctions], dtype=np.int64)
         """(J,) stage that each junction shows, or is on its way to."""
         self.begin_s = np.zeros(len(network.junctions))
@@ -39,7 +43,7 @@ class Heads:
         """(S, M + walks) which turns and which letters of pedestrians each stage has green for."""
         self._junction = network.stage_junction[self._needs.argmax(axis=0)]
         """(M + walks,) whose stages these are."""
-        self._patience_s = np.where(self._needs, _patience_s(network)[:, None], np.inf).min(axis=0)
+        self._patience_s = self._patience()
         self._since_s = np.zeros(self._needs.shape[1])
         """(M + walks,) since when somebody has been waiting for each, without green meanwhile."""
         self._stood = np.zeros(self._needs.shape[1], dtype=np.bool_)
@@ -48,8 +52,8 @@ class Heads:
         """When it is looked again who waits."""
         self._overdue: list[int] = []
         """Stages for who has waited too long, for the longest last."""
-        self._due: list[tuple[float, int, int, str]] = []
-        """A heap of (time, junction, number, letters) still to be shown."""
+        self._due: list[tuple[float, int, int, str, bool]] = []
+        """A heap of (time, junction, number, letters, whether its stage begins with them) still to be shown."""
         self._numbers = count()
         self.next_s = np.inf
         """When the next letters are due."""
@@ -66,7 +70,14 @@ class Heads:
         if now_s < self.next_s:
             return
         while self._due and self._due[0][0] <= now_s:
-            _, index, _, letters = heappop(self._due)
+            _, index, _, letters, opens = heappop(self._due)
+            if opens and self._inside is not None:
+                if self._inside.holds(index, now_s):
+                    self.begin_s[index] += HOLD_S
+                    self._ready_s[index] += HOLD_S
+                    heappush(self._due, (now_s + HOLD_S, index, next(self._numbers), letters, True))
+                    continue
+                self._inside.opens(index, int(self.stage[index]), now_s)
             self._show(index, letters)
         self.next_s = self._due[0][0] if self._due else np.inf
 
@@ -79,6 +90,8 @@ class Heads:
         if view.time_s >= self._look_s:
             self._overdue = self._late(view)
             self._look_s = view.time_s + LOOK_S
+            if self._inside is not None and self._inside.look(view):
+                self._patience_s = self._patience()
         if not self._overdue:
             return wish
         kept = wish.copy()
@@ -110,21 +123,30 @@ class Heads:
             self._ways[first, stage] = clearances.between(self.network, junction, self._times[index], first, stage)
         at_s = now_s
         for state, seconds in self._ways[first, stage]:
-            heappush(self._due, (at_s, index, next(self._numbers), state))
+            heappush(self._due, (at_s, index, next(self._numbers), state, False))
             at_s += seconds
-        heappush(self._due, (at_s, index, next(self._numbers), self.network.stages[stage].state))
+        heappush(self._due, (at_s, index, next(self._numbers), self.network.stages[stage].state, True))
+        if self._inside is not None:
+            self._inside.leads(index, first, stage, at_s)
         self.stage[index], self.begin_s[index] = stage, at_s
         self._ready_s[index] = at_s + self.network.stages[stage].least_green_s
         self.next_s = now_s
         self.advance(now_s)
 
+    def _patience(self) -> Floats:
+        """(M + walks,) how long somebody may wait for each."""
+        blocked = () if self._inside is None else self._inside.blocked
+        held_s = np.where(np.isin(self.network.stage_junction, sorted(blocked)), MOST_HOLD_S, 0.0)
+        return np.asarray(np.where(self._needs, _patience_s(self.network, held_s)[:, None], np.inf).min(axis=0))
 
-def _patience_s(network: Network) -> Floats:
+
+def _patience_s(network: Network, held_s: Floats) -> Floats:
     """(S,) how long somebody may wait for each stage until it comes next.
 
-    All others of its junction may have to be shown before, and there is time between two looks.
+    All others of its junction may have to be shown before, each `held_s` (S,) later than its clearance is over, and
+    there is time between two looks.
     """
-    until_next_s = network.least_green_s + network.clearance_s
+    until_next_s = network.least_green_s + network.clearance_s + held_s
     others_s = np.bincount(network.stage_junction, until_next_s)[network.stage_junction] - until_next_s
     return np.asarray(np.clip(LONGEST_RED_S - LOOK_S - others_s, LOOK_S, MOST_PATIENCE_S))
 

@@ -104,7 +104,7 @@ class SumoPlant:
         self._boundary_s = [junction.offset_s % junction.cycle_s for junction in network.junctions]
         self._junctions = np.arange(len(network.junctions))
         self._execution = execution
-        self._heads = Heads(network, self._show)
+        self._heads: Any = None
         self._eyes: Any = None
         self._decision_s = 0.0
         """When the execution is asked next."""
@@ -132,6 +132,7 @@ class SumoPlant:
         SumoPlant._owner = self
         self._sumo = libsumo
         self._eyes = Eyes(self.network, self._ids, libsumo)
+        self._heads = Heads(self.network, self._show, self._eyes)
         for edge, lanes in self.network.edge_lanes.items():
             whole = libsumo.edge.getLaneNumber(edge) == len(lanes)
             places = [(libsumo.edge, edge)] if whole else [(libsumo.lane, f"{edge}_{lane}") for lane in lanes]
@@ -254,7 +255,7 @@ class SumoPlant:
     def _decide(self, execution: Execution) -> float:
         """Ask the execution if it is time, and show what is due; when there is something to do next."""
         started = time.perf_counter()
-        heads = self._heads
+        heads: Heads = self._heads
         if self.time_s == 0:
             heads.start(self.time_s)
         heads.advance(self.time_s)
