@@ -659,7 +659,8 @@ class View(Protocol):
 class Execution(Protocol):
     """Whatever carries a plan out within the cycle, by what is to be seen at the moment.
 
-    An execution is built as `Class(network, **settings)`.
+    An execution is built as `Class(network, **settings)`. One that has `lets_out = True` wants red before a green to
+    last until those can have gone who are left amid the junction (plant.inside).
     """
 
     every_s: float

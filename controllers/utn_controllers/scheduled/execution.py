@@ -50,6 +50,7 @@ class Scheduled:
     """Carries a plan out, or does without, by schedules for the next minute."""
 
     Settings = ScheduledSettings
+    lets_out = True
 
     def __init__(self, network: Network, **settings: float | str):
         self.network = network

@@ -132,7 +132,8 @@ class SumoPlant:
         SumoPlant._owner = self
         self._sumo = libsumo
         self._eyes = Eyes(self.network, self._ids, libsumo)
-        self._heads = Heads(self.network, self._show, self._eyes)
+        lets_out = getattr(self._execution, "lets_out", False)
+        self._heads = Heads(self.network, self._show, self._eyes if lets_out else None)
         for edge, lanes in self.network.edge_lanes.items():
             whole = libsumo.edge.getLaneNumber(edge) == len(lanes)
             places = [(libsumo.edge, edge)] if whole else [(libsumo.lane, f"{edge}_{lane}") for lane in lanes]
