@@ -58,15 +58,20 @@ class Times:
         return cls(np.where(np.isnan(yellow_s), usual, yellow_s), between_s)
 
 
+def following(junction: Junction, stage: int) -> int:
+    """The stage that follows in the net's own programme."""
+    order = junction.stages
+    return order[(order.index(stage) + 1) % len(order)]
+
+
 def between(network: Network, junction: Junction, times: Times, first: int, then: int) -> Phases:
     """What a junction shows from the end of the stage `first` until the stage `then` begins."""
-    order = junction.stages
-    if order[(order.index(first) + 1) % len(order)] == then:
+    if following(junction, first) == then:
         return network.stages[first].clearance
     was, becomes = network.stages[first].state, network.stages[then].state
     closing = [a for a, letter in enumerate(was) if letter in GREEN and becomes[a] not in GREEN]
     opening = [b for b, letter in enumerate(becomes) if letter in GREEN and was[b] not in GREEN]
-    longest_s = max((network.stages[stage].clearance_s for stage in order), default=0.0)
+    longest_s = max((network.stages[stage].clearance_s for stage in junction.stages), default=0.0)
     needed_s = [0.0]
     for a in closing:
         needed_s += [times.yellow_s[a] * (a not in junction.without_yellow)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from utn_sumo.clearances import GREEN
+from utn_sumo.clearances import GREEN, following
 from utn_sumo.contract import Floats, Junction, Network, View
 
 GIVES_WAY, HAS_WAY = "g", "G"
@@ -69,8 +69,8 @@ class Inside:
 
     def leads(self, index: int, first: int, then: int, opens_s: float) -> None:
         """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`."""
-        junction, becomes = self._network.junctions[index], self._network.stages[then].state
-        follows = junction.stages[(junction.stages.index(first) + 1) % len(junction.stages)]
+        becomes = self._network.stages[then].state
+        follows = following(self._network.junctions[index], first)
         # To the stage that follows it is the net's own clearance, to the second.
         self._way[index] = tuple(
             each
@@ -81,14 +81,11 @@ class Inside:
 
     def holds(self, index: int, now_s: float) -> bool:
         """Whether the stage that a junction is led to has to wait for somebody."""
-        way = self._way.get(index, ())
-        self._veh[index] = max((self._entered_veh(each, now_s) for each in way), default=0.0)
+        came = [(each, self._entered_veh(each, now_s)) for each in self._way.get(index, ())]
+        self._veh[index] = max((veh for _, veh in came), default=0.0)
         if index not in self.blocked or now_s >= self._until_s[index]:
             return False
-        return any(
-            veh > 0 and self._gap_s(each) < CROSSING_S + FOLLOWING_S * min(veh, MOST_VEH)
-            for each, veh in ((each, self._entered_veh(each, now_s)) for each in way)
-        )
+        return any(veh > 0 and self._gap_s(each) < CROSSING_S + FOLLOWING_S * min(veh, MOST_VEH) for each, veh in came)
 
     def opens(self, index: int, stage: int, now_s: float) -> None:
         """A junction's stage begins."""
