@@ -17,8 +17,8 @@ from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
 from utn_controllers.scheduled.execution import Scheduled
-from utn_controllers.scheduled.moves import Moves, Rules, going
-from utn_controllers.scheduled.programme import STAYING_BINS, schedules
+from utn_controllers.scheduled.moves import Moves, Rules, going, staying
+from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, Floats, Ints, Network
 from utn_sumo.estimation import Estimator
@@ -45,6 +45,8 @@ class Crossing:
     """Share of each bin that each stream has green in the clearance from a stage to another: else all is red."""
     slowly: dict[tuple[int, int], float] = field(default_factory=dict)
     """Share of its discharge that a stream has in another's stage."""
+    staying: float = 5.0
+    """Bins that who is left at the end waits longer."""
 
     def green(self) -> Floats:
         """(S, N) share of its discharge that each stream has in each stage."""
@@ -72,7 +74,8 @@ class Crossing:
                 moves = np.vstack([moves, shares])
         first = np.array([0, stages])
         who = going(moves, stages, clearing, clearance)
-        return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least))
+        least, longer = np.array(self.least), np.array([self.staying])
+        return Rules(place, first, first, follows, moves, who, clearing, clearance, least, longer)
 
     def decide(
         self,
@@ -122,6 +125,9 @@ class Crossing:
         return ended
 
 
+Drawn = tuple[Crossing, list[float], list[list[float]], list[float], float]
+
+
 def every_sequence(crossing: Crossing) -> Iterator[list[int]]:
     """All that a junction of two stages can show, from the first one on: a stage a bin, -1 for clearance."""
 
@@ -137,26 +143,24 @@ def every_sequence(crossing: Crossing) -> Iterator[list[int]]:
     yield from go_on([], 0, 0)
 
 
-def waited(shown: list[int], stand: list[float], come: list[list[float]], worth: list[float], most: float) -> float:
+def waited(shown: list[int], drawn: Drawn) -> float:
     """Vehicles left behind in each bin, weighted and added up: a queue after the other, without any of ours."""
+    crossing, stand, come, worth, most = drawn
     total = 0.0
     for stream, standing in enumerate(stand):
         queue = standing
         for stage, arriving in zip(shown, come[stream], strict=True):
             queue = max(queue + arriving - (most if stage == stream else 0.0), 0.0)
             total += worth[stream] * queue
-        total += STAYING_BINS * worth[stream] * queue
+        total += crossing.staying * worth[stream] * queue
     return total
-
-
-Drawn = tuple[Crossing, list[float], list[list[float]], list[float], float]
 
 
 def a_bin(green: Floats, place: int, queue: Floats, drawn: Drawn) -> tuple[float, Floats]:
     """What is waited in a bin of which streams have the share `green`; the queues."""
-    _, _, come, worth, most = drawn
+    crossing, _, come, worth, most = drawn
     queue = np.maximum(queue + np.array(come)[:, place] - green * most, 0.0)
-    bins = 1 + STAYING_BINS * (place == len(come[0]) - 1)
+    bins = 1 + crossing.staying * (place == len(come[0]) - 1)
     return bins * float(np.array(worth) @ queue), queue
 
 
@@ -200,7 +204,8 @@ def lists(items: st.SearchStrategy[Any], count: int) -> st.SearchStrategy[list[A
 def junctions(draw: st.DrawFn, stages: int = 2) -> Drawn:
     """So many stages, who stands and comes, how much each is worth, and what leaves in a bin."""
     few = lists(st.integers(1, 2), stages).map(tuple)
-    crossing = Crossing(draw(few), draw(few), draw(st.integers(8, 10)))
+    longer = draw(st.sampled_from([0.0, 5.0, 20.0]))
+    crossing = Crossing(draw(few), draw(few), draw(st.integers(8, 10)), staying=longer)
     veh = st.integers(0, 24).map(lambda quarters: quarters / 4)
     share = st.sampled_from([0.0, 0.0, 0.0, 0.25, 0.5, 1.0, 2.0])
     come = draw(lists(lists(share, crossing.bins), stages))
@@ -228,11 +233,11 @@ class TestProgramme:
     def test_it_waits_hardly_more_than_the_best_of_all_sequences(self, drawn: Drawn) -> None:
         crossing, stand, come, worth, most = drawn
         wish, sent = crossing.decide(stand, np.array(come), worth=worth, most=most)
-        every = [(waited(shown, stand, come, worth, most), shown) for shown in every_sequence(crossing)]
+        every = [(waited(shown, drawn), shown) for shown in every_sequence(crossing)]
         best = min(cost for cost, _ in every)
         begun_so = min(cost for cost, shown in every if (shown[0] == 0) == (wish == 0))
         left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
-        planned = float(np.array(worth) @ (left_veh.sum(axis=1) + STAYING_BINS * left_veh[:, -1]))
+        planned = float(np.array(worth) @ (left_veh.sum(axis=1) + crossing.staying * left_veh[:, -1]))
         assert best - 1e-6 <= planned <= NEAR_ENOUGH * best + 1e-6
         assert begun_so <= NEAR_ENOUGH * best + 1e-6
 
@@ -276,7 +281,7 @@ class TestProgramme:
         wish, sent = crossing.decide(stand, np.array(come), rest=rest, worth=worth, most=most)
         found, cost = plainly(drawn, rest)
         left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
-        planned = float(np.array(worth) @ (left_veh.sum(axis=1) + STAYING_BINS * left_veh[:, -1]))
+        planned = float(np.array(worth) @ (left_veh.sum(axis=1) + crossing.staying * left_veh[:, -1]))
         assert wish in found
         assert planned == pytest.approx(cost, abs=1e-6)
 
@@ -328,6 +333,17 @@ class TestProgramme:
         three = Crossing((2, 2, 2), (2, 2, 2))
         assert three.decide([0.0, 9.0, 1.0])[0] == 1
         assert three.decide([0.0, 9.0, 1.0], most=[1.0, BLOCKED_VEH, 1.0])[0] == 2
+
+    def test_who_is_left_at_the_end_is_worth_a_clearance_the_more_the_longer_that_means_to_wait(self) -> None:
+        come = np.zeros((2, 25))
+        come[0] = 0.5
+        come[1, 22] = 8.0
+
+        def left(longer: float) -> float:
+            _, sent = Crossing((2, 2), staying=longer).decide([0.0, 0.0], come)
+            return float(come.sum() - sent.sum())
+
+        assert left(20.0) < left(0.0)
 
     def test_of_two_queues_the_one_that_is_worth_more_goes_first(self) -> None:
         three = Crossing((2, 2, 2), (2, 2, 2))
@@ -428,6 +444,16 @@ class TestStreams:
 
 
 class TestMoves:
+    def test_who_is_left_waits_longer_where_a_cycle_has_longer_clearances(self) -> None:
+        first = np.array([0, 2, 4, 7])
+        # Bins from each stage to its junction's nth: of the third junction those beside the cycle do not count.
+        quick = [[1, 2, 1], [2, 1, 1]]
+        slow = [[1, 4, 1], [4, 1, 1]]
+        three = [[1, 4, 9], [9, 1, 4], [4, 9, 1]]
+        found = staying(first, np.array([*quick, *slow, *three]))
+        assert found[0] < found[1] < found[2]
+        assert found[2] - found[1] == pytest.approx((12 - 8) * (found[1] - found[0]) / (8 - 4), rel=0.5)
+
     def test_they_are_the_stages_greens_first(self, net: Network) -> None:
         streams = Streams(net)
         moves = Moves(net, streams, 2)

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from utn_controllers.scheduled.moves import Moves, Rules
+from utn_controllers.scheduled.moves import Moves, Rules, staying
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.standstill import Standstill
@@ -81,6 +81,7 @@ class Scheduled:
             moves.row,
             moves.bins,
             np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
+            staying(self._streams.first_stage, moves.bins),
         )
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules."""

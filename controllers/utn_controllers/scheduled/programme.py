@@ -20,8 +20,6 @@ NEVER = 1e18
 """Cost of what can't be reached."""
 SOME_VEH = 0.02
 """Fewer than so many are nobody."""
-STAYING_BINS = 5
-"""Who is still there at the end waits so much longer: else what a change of stages costs later would cost nothing."""
 ALIKE = 1e-9
 """Costs that differ by no more are the same: of ways alike the one found first is kept, whatever the rounding."""
 
@@ -52,8 +50,8 @@ def schedules(
             present += 1
         stages = rules.first_stage[junction + 1] - low
         chosen = _schedule(
-            present, rest[junction], low, stages, rules, stand[a:b], come[a:b], worth[a:b], most[a:b],
-            plan[junction], sent[a:b],
+            present, rest[junction], low, stages, rules, rules.staying[junction], stand[a:b], come[a:b], worth[a:b],
+            most[a:b], plan[junction], sent[a:b],
         )  # fmt: skip
         wish[junction] = rules.stages[low + chosen]
     return wish
@@ -61,14 +59,14 @@ def schedules(
 
 @compiled
 def _schedule(
-    present: int, rest: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats,
+    present: int, rest: int, low: int, stages: int, rules: Rules, staying: float, stand: Floats, come: Floats,
     worth: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on."""
     chosen = present
     called = _called(present, low, stages, rules, stand, come)
     if called.any():
-        traffic = _sums(rules.moves[low : low + stages], stand, come, worth, most)
+        traffic = _sums(rules.moves[low : low + stages], stand, come, worth, most, staying)
         # What was best a bin ago is seldom far from what is best now.
         known = _waited(plan, rules.moves, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
@@ -105,6 +103,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
 ) -> int:
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
+    staying = traffic.staying
     moves, going, clearing, clearance = rules.moves, rules.going, rules.clearing, rules.clearance
     came, least = traffic.came, rules.least
     (streams, bins), stages = come.shape, len(called)
@@ -156,11 +155,13 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                         opens = min(now + clearance[row, other], bins)
                         if spent >= cost[opens, other] - ALIKE:
                             continue
-                        until = spent + _held(stages, grown, paid, now, opens, held + moving)
+                        until = spent + _held(stages, grown, paid, staying, now, opens, held + moving)
                         if clearing[row, other] >= 0:
                             if clearing[row, other] != won_in:
                                 won_in = clearing[row, other]
-                                won = _won(won_in, begin, row, now, opens, veh, moves, going, come, came, worth, most)
+                                won = _won(
+                                    won_in, begin, row, now, opens, veh, moves, going, come, came, worth, most, staying
+                                )  # fmt: skip
                             until -= won
                         if until < cost[opens, other] - ALIKE:
                             cost[opens, other] = until
@@ -169,7 +170,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                             whence[opens, other, 2] = now
                     if now >= must_end:
                         break
-                spent += _held(stage, grown, paid, now, now + 1, held)
+                spent += _held(stage, grown, paid, staying, now, now + 1, held)
                 held += grown[stage, now + 1] - grown[stage, now]
                 moving = 0.0
                 for place in range(greens):
@@ -178,7 +179,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
                     moving += worth[stream] * veh[stream]
                 now += 1
-                spent += moving * (1 + STAYING_BINS * (now == bins))
+                spent += moving * (1 + staying * (now == bins))
             if now == bins and spent < best - ALIKE:
                 best, last_begin, last_stage = spent, begin, stage
     for stage in range(stages):
@@ -189,7 +190,9 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
 
 
 @compiled
-def _sums(serves: Floats, stand: Floats, come: Floats, worth: Floats, most: Floats) -> Traffic:
+def _sums(
+    serves: Floats, stand: Floats, come: Floats, worth: Floats, most: Floats, staying: float
+) -> Traffic:  # fmt: skip
     """The traffic with what the costs of red are made of."""
     stages, (streams, bins) = len(serves), come.shape
     came = np.zeros((streams, bins + 1))
@@ -204,21 +207,23 @@ def _sums(serves: Floats, stand: Floats, come: Floats, worth: Floats, most: Floa
     for stage in range(stages + 1):
         for place in range(bins):
             paid[stage, place + 1] = paid[stage, place] + grown[stage, place + 1]
-        paid[stage, bins] += STAYING_BINS * grown[stage, bins]
-    return Traffic(stand, come, came, grown, paid, worth, most)
+        paid[stage, bins] += staying * grown[stage, bins]
+    return Traffic(stand, come, came, grown, paid, worth, most, staying)
 
 
 @compiled
-def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weight: float) -> float:
+def _held(
+    stage: int, grown: Floats, paid: Floats, staying: float, since: int, until: int, weight: float
+) -> float:  # fmt: skip
     """What those wait in some bins who have red in a stage, and of whom so much stood before."""
-    over = until - since + STAYING_BINS * (until > since and until == grown.shape[1] - 1)
+    over = until - since + staying * (until > since and until == grown.shape[1] - 1)
     return float(paid[stage, until] - paid[stage, since] + over * (weight - grown[stage, since]))
 
 
 @compiled
 def _won(
     clearing: int, begin: int, row: int, end: int, until: int, veh: Floats, moves: Floats, going: Ints, come: Floats,
-    came: Floats, worth: Floats, most: Floats,
+    came: Floats, worth: Floats, most: Floats, staying: float,
 ) -> float:  # fmt: skip
     """What is waited less in a clearance than if all had red; `veh` of who had red already as the stage began."""
     won, place = 0.0, 0
@@ -231,7 +236,7 @@ def _won(
         for now in range(end, until):
             red += come[stream, now]
             queue = max(queue + come[stream, now] - moves[clearing + now - end, stream] * most[stream], 0.0)
-            less += (red - queue) * (1 + STAYING_BINS * (now == come.shape[1] - 1))
+            less += (red - queue) * (1 + staying * (now == come.shape[1] - 1))
         won += worth[stream] * less
         place += 1
     return won
@@ -275,7 +280,7 @@ def _waited(plan: Ints, moves: Floats, traffic: Traffic) -> float:
             if share > 0:
                 veh = max(veh - share * traffic.most[stream], 0.0)
             waited += veh
-        waited += STAYING_BINS * veh
+        waited += traffic.staying * veh
         total += traffic.worth[stream] * waited
     return total
 

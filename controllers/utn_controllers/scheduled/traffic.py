@@ -24,3 +24,5 @@ class Traffic(NamedTuple):
     """(n,) weight of a vehicle."""
     most: Floats
     """(n,) vehicles that leave in a bin of green."""
+    staying: float
+    """Bins that who is still there at the end waits longer."""
