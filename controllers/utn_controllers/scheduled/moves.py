@@ -105,7 +105,7 @@ def staying(first_stage: Ints, clearance: Ints) -> Floats:
     sizes = np.diff(first_stage)
     lost = [
         sum(clearance[first + place, (place + 1) % size] for place in range(size))
-        for first, size in zip(first_stage, sizes, strict=False)
+        for first, size in zip(first_stage[:-1], sizes, strict=True)
     ]
     return np.maximum(STAYING_OF_LOST * (np.array(lost) - QUICK_BINS), LEAST_STAYING_BINS)
 
