@@ -15,7 +15,8 @@ import numpy as np
 
 from utn_sumo.contract import Floats, Junction, Network
 
-GREEN, YELLOW = "Gg", "yY"
+HAS_WAY, GIVES_WAY = "G", "g"
+GREEN, YELLOW = HAS_WAY + GIVES_WAY, "yY"
 USUAL_YELLOW_S = 3.0
 
 Phases = tuple[tuple[str, float], ...]

@@ -7,7 +7,8 @@ vehicle that changes lanes in the very step in which it crosses (38 of 42,900 in
 turns apart. All report once a control step, which is when they are read: interval counts, never sums of steps (SPEC
 6).
 
-Where an execution decides within the control step, more lane-area detectors cut the same 200 m into zones.
+Where an execution decides within the control step, more lane-area detectors cut the same 200 m into zones, and some see
+who waits amid a junction because their green gives way to others.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.contract import ZONES_M, Floats, LaneGroup, Link, Measurement, Network
 
 ENTRY_M = 1.0
@@ -31,6 +33,8 @@ CAR_M = 5.0
 """The detector of a zone ends so much before the zone: it sees a car until its back has gone by."""
 LEAST_M = 0.1
 """Shortest detector that SUMO takes."""
+NEARLY_M = -0.01
+"""Detectors on lanes amid a junction end so much before the lane does, from where SUMO counts what is below 0."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ class DetectorIds:
     """(G, zones) of the detectors of zones those on a lane group."""
     upstream_zone: tuple[tuple[tuple[str, ...], ...], ...]
     """(Z, zones) those before the lane groups part."""
+    amid: tuple[tuple[str, ...], ...]
+    """(M,) of the lane-area detectors amid junctions those of each turn that gives way in some stage, else none."""
 
 
 def ids(network: Network) -> DetectorIds:
@@ -100,7 +106,20 @@ def ids(network: Network) -> DetectorIds:
         parting=tuple(tuple(_named("side", lane) for lane in link.parting) for link in network.links),
         group_zone=tuple(in_zones(group.link, at_line(group)) for group in network.groups),
         upstream_zone=tuple(in_zones(index, before(link)) for index, link in enumerate(network.links)),
+        amid=tuple(tuple(_named("amid", lane) for lane in lanes) for lanes in _amid(network)),
     )
+
+
+def _amid(network: Network) -> list[tuple[str, ...]]:
+    """(M,) lanes amid junctions on which each turn waits that gives way in some stage."""
+    giving = {
+        turn
+        for stage in network.stages
+        for shown, turns in zip(stage.state, network.junctions[stage.junction].signal_turns, strict=True)
+        if shown == GIVES_WAY
+        for turn in turns
+    }
+    return [turn.via_lanes if index in giving else () for index, turn in enumerate(network.turns)]
 
 
 def _named(kind: str, lane: str) -> str:
@@ -123,40 +142,47 @@ def _zones(network: Network, link: Link) -> list[tuple[str, int, float, float]]:
     return pieces
 
 
-def _areas(network: Network, link: Link, *, zones: bool) -> Iterator[tuple[str, str, float, float]]:
-    """(kind, edge, metres from its begin, to) of the lane-area detectors on each of its lanes."""
-    for edge, seen_m in network.watched(link):
-        length_m = network.edge_length_m[edge]
-        yield "area", edge, length_m - seen_m, length_m
-    for edge, zone, from_m, to_m in _zones(network, link) if zones else ():
-        yield f"zone{zone}", edge, from_m, max(to_m - CAR_M, from_m + LEAST_M)
-
-
-def write(network: Network, path: Path, period_s: float, *, zones: bool = False) -> None:
-    """Write the additional file; its detectors report every `period_s` seconds. Those of zones if they are wanted."""
-    root = ET.Element("additional")
-    report = {"period": f"{period_s:g}", "file": "NUL", "friendlyPos": "true"}
-
-    def loop(name: str, lane: str, position_m: float) -> None:
-        ET.SubElement(root, "inductionLoop", {"id": name, "lane": lane, "pos": f"{position_m:g}", **report})
-
-    def areas(kind: str, edge: str, from_m: float, to_m: float) -> None:
-        for lane in network.edge_lanes[edge]:
-            place = {"lane": f"{edge}_{lane}", "pos": f"{from_m:g}", "endPos": f"{to_m:g}"}
-            ET.SubElement(root, "laneAreaDetector", {"id": _named(kind, f"{edge}_{lane}"), **place, **report})
-
+def _loops(network: Network) -> Iterator[tuple[str, str, float]]:
+    """(kind, lane, metres from its begin, or to its end below 0) of the loops."""
     for link in network.links:
         for kind, edge, position_m in (("entry", link.edges[0], ENTRY_M), ("stop", link.edges[-1], STOP_LINE_M)):
             for lane in network.edge_lanes[edge]:
-                loop(_named(kind, f"{edge}_{lane}"), f"{edge}_{lane}", position_m)
-        for kind, edge, from_m, to_m in _areas(network, link, zones=zones):
-            areas(kind, edge, from_m, to_m)
+                yield kind, f"{edge}_{lane}", position_m
     turning = [via for turn in network.turns for via in turn.via_lanes]
     # One link's traffic may part onto another's: one loop then counts for both.
     beside = sorted({via for link in network.links for via in (*link.joining, *link.parting)})
     for kind, lanes in (("turn", turning), ("side", beside)):
         for via in lanes:
-            loop(_named(kind, via), via, TURN_M)
+            yield kind, via, TURN_M
+
+
+def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, float, float]]:
+    """(kind, lane, metres from its begin, to) of the lane-area detectors."""
+    for link in network.links:
+        length_m = network.edge_length_m
+        pieces = [("area", edge, length_m[edge] - seen_m, length_m[edge]) for edge, seen_m in network.watched(link)]
+        for edge, zone, from_m, to_m in _zones(network, link) if within_step else ():
+            pieces.append((f"zone{zone}", edge, from_m, max(to_m - CAR_M, from_m + LEAST_M)))
+        for kind, edge, from_m, to_m in pieces:
+            for lane in network.edge_lanes[edge]:
+                yield kind, f"{edge}_{lane}", from_m, to_m
+    for via in (via for lanes in _amid(network) for via in lanes if within_step):
+        yield "amid", via, 0.0, NEARLY_M
+
+
+def write(network: Network, path: Path, period_s: float, *, within_step: bool = False) -> None:
+    """Write the additional file; its detectors report every `period_s` seconds.
+
+    With those by which an execution decides within the control step if they are wanted.
+    """
+    root = ET.Element("additional")
+    report = {"period": f"{period_s:g}", "file": "NUL", "friendlyPos": "true"}
+    for kind, lane, position_m in _loops(network):
+        place = {"lane": lane, "pos": f"{position_m:g}"}
+        ET.SubElement(root, "inductionLoop", {"id": _named(kind, lane), **place, **report})
+    for kind, lane, from_m, to_m in _areas(network, within_step=within_step):
+        place = {"lane": lane, "pos": f"{from_m:g}", "endPos": f"{to_m:g}"}
+        ET.SubElement(root, "laneAreaDetector", {"id": _named(kind, lane), **place, **report})
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
 

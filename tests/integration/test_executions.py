@@ -236,10 +236,12 @@ def test_zones_show_where_vehicles_are(tmp_path: Path) -> None:
 @pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
 def test_zones_cover_what_the_detectors_see_and_nothing_twice(make: Callable[[Path], Path], tmp_path: Path) -> None:
     net = streets.named(str(make(tmp_path)))
-    write(net, tmp_path / "detectors.add.xml", 90, zones=True)
+    write(net, tmp_path / "detectors.add.xml", 90, within_step=True)
     areas: dict[str, list[tuple[float, float]]] = {}
     zones: dict[str, list[tuple[float, float]]] = {}
     for element in ET.parse(tmp_path / "detectors.add.xml").getroot().iter("laneAreaDetector"):
+        if element.attrib["id"].startswith("utn_amid"):
+            continue
         kind = zones if "_zone" in element.attrib["id"] else areas
         kind.setdefault(element.attrib["lane"], []).append(
             (float(element.attrib["pos"]), float(element.attrib["endPos"]))

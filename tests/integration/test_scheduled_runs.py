@@ -111,9 +111,9 @@ def test_who_waits_amid_a_junction_is_let_out_before_the_next_road_comes_under_s
     controller: str, better: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     delay_s = []
-    for looks in (10**9, inside.UNUSED_LOOKS):
-        monkeypatch.setattr(inside, "UNUSED_LOOKS", looks)
-        folder = tmp_path / str(looks)
+    for hold_s in (0.0, inside.MOST_HOLD_S):
+        monkeypatch.setattr(inside, "MOST_HOLD_S", hold_s)
+        folder = tmp_path / str(hold_s)
         folder.mkdir()
         chosen = scenario(net=str(wide_crossing(folder)), controller=controller, seed=4)
         result = bridge.run(chosen, folder / "run")

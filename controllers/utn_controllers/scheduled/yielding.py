@@ -11,10 +11,9 @@ import numpy as np
 from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.standstill import Shown
 from utn_controllers.scheduled.streams import Streams
+from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
-GIVES_WAY = "g"
-"""The signal letter of green for who must give way."""
 START_S = 3.0
 """From a green's begin until its flow is counted."""
 MEMORY_S = 10.0

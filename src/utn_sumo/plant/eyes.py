@@ -13,6 +13,9 @@ from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.heads import Heads
 
+CLOSE_ZONES = 2
+"""Who is in these, up to 50 m, is at the stop line within a few seconds."""
+
 
 class Eyes:
     """Reads the lane-area detectors and the loops of a network."""
@@ -39,6 +42,8 @@ class Eyes:
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
+        self._amid = ids.amid
+        self._group_close = [list(chain.from_iterable(zones[:CLOSE_ZONES])) for zones in ids.group_zone]
         self._step_s = network.control_step_s
         self._halting = _bare(sumo, "lanearea", "getLastStepHaltingNumber")
         self._present = _bare(sumo, "lanearea", "getLastStepVehicleNumber")
@@ -97,14 +102,17 @@ class Eyes:
         veh = float(sum(map(self._present, own)))
         return veh + float(self._share[group]) * sum(map(self._present, before)) if before else veh
 
-    def left_one_veh(self, group: int, time_s: float) -> float:
-        """That have left over the stop line of one lane group since the run began."""
-        counted = 0 if time_s % self._step_s == 0 else sum(map(self._counted, self._group_stop_line[group]))
-        return float(self._left_veh[group]) + counted
-
     def gap_one_s(self, group: int) -> float:
         """Since a vehicle was last on the stop-line loops of one lane group."""
         return float(min(map(self._since_s, self._group_stop_line[group])))
+
+    def amid_veh(self, turn: int) -> float:
+        """Of a turn that gives way in some stage, on the lanes amid the junction on which it waits."""
+        return float(sum(map(self._present, self._amid[turn])))
+
+    def close_veh(self, group: int) -> float:
+        """In the zones of one lane group up to CLOSE_ZONES, moving or not."""
+        return float(sum(map(self._present, self._group_close[group])))
 
     def _by_group(self, veh: Floats) -> Floats:
         """(G,) counts by lane group, of (G + Z,) with those before the lanes part, shared out as traffic is."""

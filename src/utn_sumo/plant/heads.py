@@ -11,7 +11,7 @@ import numpy as np
 from utn_sumo import clearances
 from utn_sumo.clearances import Phases, Times
 from utn_sumo.contract import Bools, Floats, Ints, Network, View
-from utn_sumo.plant.inside import MOST_HOLD_S, Inside, Loops
+from utn_sumo.plant.inside import MOST_HOLD_S, Areas, Inside
 
 MOST_PATIENCE_S = 150.0
 """Who has waited so long without green is served next, whatever is wished."""
@@ -26,11 +26,11 @@ HOLD_S = 1.0
 class Heads:
     """The signals of a network: the stage of each junction, or the clearance on the way to it."""
 
-    def __init__(self, network: Network, show: Callable[[int, str], None], loops: Loops | None = None):
-        """`show` puts letters on the signals of a junction; without `loops` nobody is waited for amid it."""
+    def __init__(self, network: Network, show: Callable[[int, str], None], areas: Areas | None = None):
+        """`show` puts letters on the signals of a junction; without `areas` nobody is waited for amid it."""
         self.network = network
         self._show = show
-        self._inside = None if loops is None else Inside(network, loops)
+        self._inside = None if areas is None else Inside(network, areas)
         self.stage: Ints = np.array([junction.stages[0] for junction in network.junctions], dtype=np.int64)
         """(J,) stage that each junction shows, or is on its way to."""
         self.begin_s = np.zeros(len(network.junctions))
@@ -43,7 +43,12 @@ class Heads:
         """(S, M + walks) which turns and which letters of pedestrians each stage has green for."""
         self._junction = network.stage_junction[self._needs.argmax(axis=0)]
         """(M + walks,) whose stages these are."""
-        self._patience_s = self._patience()
+        held_s = np.zeros(len(network.junctions))
+        if self._inside is not None:
+            held_s += MOST_HOLD_S * self._inside.may_hold()
+        least_s = _patience_s(network, held_s[network.stage_junction])
+        self._patience_s = np.where(self._needs, least_s[:, None], np.inf).min(axis=0)
+        """(M + walks,) how long somebody may wait for each."""
         self._since_s = np.zeros(self._needs.shape[1])
         """(M + walks,) since when somebody has been waiting for each, without green meanwhile."""
         self._stood = np.zeros(self._needs.shape[1], dtype=np.bool_)
@@ -71,13 +76,11 @@ class Heads:
             return
         while self._due and self._due[0][0] <= now_s:
             _, index, _, letters, opens = heappop(self._due)
-            if opens and self._inside is not None:
-                if self._inside.holds(index, now_s):
-                    self.begin_s[index] += HOLD_S
-                    self._ready_s[index] += HOLD_S
-                    heappush(self._due, (now_s + HOLD_S, index, next(self._numbers), letters, True))
-                    continue
-                self._inside.opens(index, int(self.stage[index]), now_s)
+            if opens and self._inside is not None and self._inside.holds(index, now_s):
+                self.begin_s[index] += HOLD_S
+                self._ready_s[index] += HOLD_S
+                heappush(self._due, (now_s + HOLD_S, index, next(self._numbers), letters, True))
+                continue
             self._show(index, letters)
         self.next_s = self._due[0][0] if self._due else np.inf
 
@@ -90,8 +93,6 @@ class Heads:
         if view.time_s >= self._look_s:
             self._overdue = self._late(view)
             self._look_s = view.time_s + LOOK_S
-            if self._inside is not None and self._inside.look(view):
-                self._patience_s = self._patience()
         if not self._overdue:
             return wish
         kept = wish.copy()
@@ -132,12 +133,6 @@ class Heads:
         self._ready_s[index] = at_s + self.network.stages[stage].least_green_s
         self.next_s = now_s
         self.advance(now_s)
-
-    def _patience(self) -> Floats:
-        """(M + walks,) how long somebody may wait for each."""
-        blocked = () if self._inside is None else self._inside.blocked
-        held_s = np.where(np.isin(self.network.stage_junction, sorted(blocked)), MOST_HOLD_S, 0.0)
-        return np.asarray(np.where(self._needs, _patience_s(self.network, held_s)[:, None], np.inf).min(axis=0))
 
 
 def _patience_s(network: Network, held_s: Floats) -> Floats:

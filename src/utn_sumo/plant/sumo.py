@@ -120,7 +120,7 @@ class SumoPlant:
 
         additional = [self.folder / "detectors.add.xml", self.folder / "outputs.add.xml"]
         within_step = self._execution is not None
-        detectors.write(self.network, additional[0], self.network.control_step_s, zones=within_step)
+        detectors.write(self.network, additional[0], self.network.control_step_s, within_step=within_step)
         write_outputs(additional[1])
         arguments = self._arguments(additional)
         started = time.perf_counter()
