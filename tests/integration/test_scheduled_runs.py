@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import tuning_nets
 from utn_sumo import bridge, monitor
 from utn_sumo.contract import Network
 from utn_sumo.plant import inside
@@ -120,3 +121,14 @@ def test_who_waits_amid_a_junction_is_let_out_before_the_next_road_comes_under_s
         assert result["unsafe_signal_s"] == result["fallbacks"] == 0
         delay_s.append(result["mean_delay_s"])
     assert delay_s[1] < 0.7 * delay_s[0] if better else delay_s[1] == delay_s[0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [5, 7])
+def test_turns_that_stand_before_people_lock_no_street_under_schedules(seed: int, tmp_path: Path) -> None:
+    net = tuning_nets.write("walkers", tmp_path / "walkers")
+    result = bridge.run(scenario(net=str(net), controller="recommended", seed=seed), tmp_path / "run")
+    assert_safe(result)
+    assert result["teleports"] == 0
+    # Under locks 66 s and 137 s.
+    assert result["mean_delay_s"] < 60

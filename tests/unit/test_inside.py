@@ -1,4 +1,4 @@
-"""Who waits amid a junction: let out before the next road's green."""
+"""Who waits amid a junction is let out before the next road's green."""
 
 from __future__ import annotations
 
@@ -25,13 +25,23 @@ class Traffic:
 
     def __init__(self) -> None:
         self.inside_veh: dict[int, float] = defaultdict(float)
+        self.standing_veh: dict[int, float] = defaultdict(float)
         self.coming_veh: dict[int, float] = defaultdict(float)
 
     def amid_veh(self, turn: int) -> float:
         return self.inside_veh[turn]
 
+    def halting_amid_veh(self, turn: int) -> float:
+        return self.standing_veh[turn]
+
     def close_veh(self, group: int) -> float:
         return self.coming_veh[group]
+
+
+def _turns_with(network: Network, stage: int, letters: str) -> list[int]:
+    """Turns of the first junction that have one of these letters in a stage."""
+    shown = zip(network.stages[stage].state, network.junctions[0].signal_turns, strict=True)
+    return [turn for letter, turns in shown for turn in turns if letter in letters]
 
 
 class Crossing:
@@ -46,12 +56,7 @@ class Crossing:
         self.alone = network.junctions[0].stages[(places[0] + 1) % count]
         self.traffic = Traffic()
         self.inside = Inside(network, self.traffic)
-        self.turning, self.next_turning = (self._giving_way(stage) for stage in (self.through, self.across))
-
-    def _giving_way(self, stage: int) -> list[int]:
-        """Turns that give way in a stage."""
-        letters = zip(self.network.stages[stage].state, self.network.junctions[0].signal_turns, strict=True)
-        return [turn for shown, turns in letters for turn in turns if shown == "g"]
+        self.turning, self.next_turning = (_turns_with(network, stage, "g") for stage in (self.through, self.across))
 
     def full(self) -> Traffic:
         """Two of the one road amid the junction, and one of the other one close to it."""
@@ -142,9 +147,62 @@ def test_where_reds_may_be_drawn_out_who_waits_is_served_sooner(crossing: Crossi
     assert waited_s[0] - waited_s[1] == pytest.approx(others * MOST_HOLD_S, abs=LOOK_S)
 
 
+class Walked:
+    """A crossroads of two stages whose turns give way to people on the crossings at their exits."""
+
+    def __init__(self, network: Network):
+        self.network = network
+        self.first, self.then = network.junctions[0].stages
+        self.traffic = Traffic()
+        self.inside = Inside(network, self.traffic)
+        self.turning = _turns_with(network, self.first, "g")
+
+    def holds_for(self, turn: int, *groups: int) -> bool:
+        """Who turns stands before a crossing when the next road's green is to begin, others are close on these."""
+        self.traffic.standing_veh = defaultdict(float, {turn: 1.0})
+        self.traffic.inside_veh = self.traffic.standing_veh
+        self.traffic.coming_veh = defaultdict(float, dict.fromkeys(groups, 1.0))
+        self.inside.leads(0, self.first, self.then, 23.0)
+        return self.inside.holds(0, 23.0)
+
+
+@pytest.fixture
+def walked(street_of: StreetOf) -> Walked:
+    return Walked(street_of(odd_nets.pedestrians))
+
+
+def test_one_who_stands_before_people_holds_those_who_would_come_into_its_way(walked: Walked) -> None:
+    network = walked.network
+    for turn in walked.turning:
+        street = network.turns[turn].to_edge
+        joins = {
+            network.turns[other].group
+            for other in _turns_with(network, walked.then, "gG")
+            if network.turns[other].to_edge == street
+        }
+        assert joins
+        groups = range(len(network.groups))
+        assert joins <= {group for group in groups if walked.holds_for(turn, group)}
+        assert not walked.holds_for(turn, network.turns[turn].group)
+        # Here too the red ends at last.
+        assert walked.holds_for(turn, *joins)
+        assert walked.inside.holds(0, 23.0 + MOST_HOLD_S - 1)
+        assert not walked.inside.holds(0, 23.0 + MOST_HOLD_S)
+
+
+def test_nobody_is_held_for_one_who_moves_or_has_green_in_the_next_stage(walked: Walked) -> None:
+    everybody = range(len(walked.network.groups))
+    turn = walked.turning[0]
+    assert walked.holds_for(turn, *everybody)
+    walked.traffic.standing_veh = defaultdict(float)
+    assert not walked.inside.holds(0, 23.0)
+    for next_turn in _turns_with(walked.network, walked.then, "g"):
+        assert not walked.holds_for(next_turn, *everybody)
+
+
 def test_where_no_turn_gives_way_nobody_is_ever_waited_for(utn17: Network) -> None:
     traffic = Traffic()
-    traffic.inside_veh = traffic.coming_veh = defaultdict(lambda: 1.0)
+    traffic.inside_veh = traffic.standing_veh = traffic.coming_veh = defaultdict(lambda: 1.0)
     inside = Inside(utn17, traffic)
     assert not inside.may_hold().any()
     for index, junction in enumerate(utn17.junctions):

@@ -110,6 +110,10 @@ class Eyes:
         """Of a turn that gives way in some stage, on the lanes amid the junction on which it waits."""
         return float(sum(map(self._present, self._amid[turn])))
 
+    def halting_amid_veh(self, turn: int) -> float:
+        """Of those, who stand."""
+        return float(sum(map(self._halting, self._amid[turn])))
+
     def close_veh(self, group: int) -> float:
         """In the zones of one lane group up to CLOSE_ZONES, moving or not."""
         return float(sum(map(self._present, self._group_close[group])))

@@ -1,9 +1,10 @@
-"""Who waits amid a junction: turns let in on a green that gives way, for whom no gap has come when it ends.
+"""Who waits amid a junction when the green that let it in has ended: turns that give way to others.
 
-The net's own programme gives them a stage of their own then. Where that one is left out, the next road's green finds
-them in its way, its own turns come to stand beside them, and when those of all roads wait for each other nobody ever
-moves again. So while the lane-area detectors amid the junction see several, and turns that are to give way in the next
-green are about to come in, the red before it lasts.
+Those who found no gap in oncoming traffic have a stage of their own then, in the net's own programme. Where that one is
+left out, the next road's green finds them in its way, its own turns come to stand beside them, and when those of all
+roads wait for each other nobody ever moves again. Those who stand before people on the crossing at their exit are in
+the way of whoever turns into the same street, and what stops behind these fills the junction. So while the lane-area
+detectors amid it see such vehicles, and others are about to come into their way, the red before the next green lasts.
 """
 
 from __future__ import annotations
@@ -26,19 +27,22 @@ class Areas(Protocol):
     """What it takes to know who waits (plant.eyes)."""
 
     def amid_veh(self, turn: int) -> float: ...
+    def halting_amid_veh(self, turn: int) -> float: ...
     def close_veh(self, group: int) -> float: ...
 
 
 @dataclass(frozen=True)
 class Turning:
-    """A signal letter that gives way to oncoming traffic in some stage."""
+    """A signal letter that gives way in some stage."""
 
     letter: int
     turns: tuple[int, ...]
     groups: tuple[int, ...]
     """Lane groups from which it comes in."""
     oncoming: tuple[int, ...]
-    """Letters that it gives way to."""
+    """Letters of traffic that it gives way to."""
+    walked: bool
+    """It gives way to people on crossings too."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,11 @@ class Way:
     """From one stage to another one."""
 
     left: tuple[int, ...]
-    """Turns that may still be amid the junction, and whom the next stage does not let out."""
+    """Turns for whom no gap in oncoming traffic may have come, and whom the next stage does not let out."""
     coming: tuple[int, ...]
     """Lane groups of turns that give way in it."""
+    before_walks: tuple[tuple[int, tuple[int, ...]], ...]
+    """Turns that may stand before people who walk, each with the lane groups that come into its way."""
     until_s: float
     """It begins no later."""
 
@@ -69,41 +75,62 @@ class Inside:
 
     def leads(self, index: int, first: int, then: int, opens_s: float) -> None:
         """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`."""
-        becomes = self._network.stages[then].state
+        network, turnings = self._network, self._turnings[index]
+        becomes = network.stages[then].state
         left = [
             turn
-            for each in self._turnings[index]
-            if not any(becomes[letter] in GREEN for letter in (each.letter, *each.oncoming))
+            for each in turnings
+            if each.oncoming and not any(becomes[letter] in GREEN for letter in (each.letter, *each.oncoming))
             for turn in each.turns
         ]
-        coming = [group for each in self._turnings[index] if becomes[each.letter] == GIVES_WAY for group in each.groups]
-        # To the stage that follows it is the net's own clearance, to the second.
-        is_own = then == following(self._network.junctions[index], first)
-        self._ways[index] = Way(() if is_own else tuple(left), tuple(coming), opens_s + MOST_HOLD_S)
+        coming = [
+            group for each in turnings if each.oncoming and becomes[each.letter] == GIVES_WAY for group in each.groups
+        ]
+        before_walks = [
+            (turn, _into_its_way(network, network.junctions[index], each.letter, becomes))
+            for each in turnings
+            if each.walked and becomes[each.letter] not in GREEN
+            for turn in each.turns
+        ]
+        # To the stage that follows it is the net's own clearance, to the second, but for who walks.
+        is_own = then == following(network.junctions[index], first)
+        self._ways[index] = Way(
+            () if is_own else tuple(left), tuple(coming), tuple(before_walks), opens_s + MOST_HOLD_S
+        )
 
     def holds(self, index: int, now_s: float) -> bool:
         """Whether the stage that a junction is led to has to wait for somebody."""
-        way = self._ways[index]
-        return (
-            now_s < way.until_s
-            and sum(self._areas.amid_veh(turn) for turn in way.left) > ALONE_VEH
-            and any(self._areas.close_veh(group) > 0 for group in way.coming)
+        way, areas = self._ways[index], self._areas
+        if now_s >= way.until_s:
+            return False
+        found_no_gap = sum(areas.amid_veh(turn) for turn in way.left) > ALONE_VEH
+        if found_no_gap and any(areas.close_veh(group) > 0 for group in way.coming):
+            return True
+        return any(
+            areas.halting_amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
+            for turn, groups in way.before_walks
         )
+
+
+def _into_its_way(network: Network, junction: Junction, letter: int, state: str) -> tuple[int, ...]:
+    """Lane groups that have green in a state and cross or join the streams of a letter."""
+    crossing = zip(junction.conflicts[letter], state, junction.signal_turns, strict=True)
+    turns = [turn for conflicts, shown, turns in crossing if conflicts and shown in GREEN for turn in turns]
+    return tuple(sorted({network.turns[turn].group for turn in turns}))
 
 
 def _turnings(network: Network, junction: Junction) -> list[Turning]:
     """Those of a junction, by letter."""
-    states = [network.stages[stage].state for stage in junction.stages]
+    traffic = [len(turns) > 0 for turns in junction.signal_turns]
     found = []
     for letter, turns in enumerate(junction.signal_turns):
-        oncoming = {
-            other
-            for state in states
-            if state[letter] == GIVES_WAY
-            for other, has in enumerate(state)
-            if has == HAS_WAY and junction.conflicts[letter][other] and junction.signal_turns[other]
-        }
-        if turns and oncoming:
-            groups = {network.turns[turn].group for turn in turns}
-            found.append(Turning(letter, turns, tuple(sorted(groups)), tuple(sorted(oncoming))))
+        states = [network.stages[stage].state for stage in junction.stages]
+        giving = [state for state in states if traffic[letter] and state[letter] == GIVES_WAY]
+        having = {other for state in giving for other, has in enumerate(state) if has == HAS_WAY}
+        oncoming = tuple(sorted(other for other in having if traffic[other] and junction.conflicts[letter][other]))
+        # The crossing at its exit is in no conflict with it (SPEC 8), others' letters that stop no traffic are of none.
+        walked = any(not traffic[other] and any(junction.conflicts[other]) for other in having)
+        if oncoming or walked:
+            groups = tuple(sorted({network.turns[turn].group for turn in turns}))
+            found.append(Turning(letter, turns, groups, oncoming, walked))
     return found
