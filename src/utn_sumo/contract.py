@@ -101,7 +101,7 @@ class Stage:
     min_green_s: float
     """Of a plan."""
     least_green_s: float
-    """Where an execution ends it: the net's own least, else what SUMO's own signals keep, if nobody walks in it."""
+    """Where an execution ends it: the net's own least, else what SUMO's own signals keep."""
     held: tuple[tuple[int, ...], ...] = ()
     """Turns that are green in each part of the clearance: still from this stage, or already for the next."""
 
@@ -124,6 +124,12 @@ class Junction:
     """conflicts[a][b]: the streams of letters a and b cross, or come from two roads into one lane."""
     without_yellow: tuple[int, ...] = ()
     """Letters that need none: pedestrian crossings', and those of no stream."""
+
+    @property
+    def is_walked(self) -> bool:
+        """Whether streams that no motor traffic is part of cross others: people walk here."""
+        letters = zip(self.signal_turns, self.conflicts, strict=True)
+        return any(not turns and any(conflicts) for turns, conflicts in letters)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ turns apart. All report once a control step, which is when they are read: interv
 6).
 
 Where an execution decides within the control step, more lane-area detectors cut the same 200 m into zones, and some see
-who waits amid a junction because their green gives way to others.
+who waits amid a junction because their green gives way to others, or who is amid it late where people walk.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class DetectorIds:
     upstream_zone: tuple[tuple[tuple[str, ...], ...], ...]
     """(Z, zones) those before the lane groups part."""
     amid: tuple[tuple[str, ...], ...]
-    """(M,) of the lane-area detectors amid junctions those of each turn that gives way in some stage, else none."""
+    """(M,) of the lane-area detectors amid junctions those of each turn that may wait there, else none."""
 
 
 def ids(network: Network) -> DetectorIds:
@@ -111,15 +111,15 @@ def ids(network: Network) -> DetectorIds:
 
 
 def _amid(network: Network) -> list[tuple[str, ...]]:
-    """(M,) lanes amid junctions on which each turn waits that gives way in some stage."""
-    giving = {
+    """(M,) lanes amid junctions on which each turn waits that gives way in some stage, and all where people walk."""
+    waiting = {
         turn
-        for stage in network.stages
-        for shown, turns in zip(stage.state, network.junctions[stage.junction].signal_turns, strict=True)
-        if shown == GIVES_WAY
+        for junction in network.junctions
+        for letter, turns in enumerate(junction.signal_turns)
+        if junction.is_walked or any(network.stages[stage].state[letter] == GIVES_WAY for stage in junction.stages)
         for turn in turns
     }
-    return [turn.via_lanes if index in giving else () for index, turn in enumerate(network.turns)]
+    return [turn.via_lanes if index in waiting else () for index, turn in enumerate(network.turns)]
 
 
 def _named(kind: str, lane: str) -> str:

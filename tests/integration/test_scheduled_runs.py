@@ -124,11 +124,14 @@ def test_who_waits_amid_a_junction_is_let_out_before_the_next_road_comes_under_s
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [5, 7])
-def test_turns_that_stand_before_people_lock_no_street_under_schedules(seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("seed", "demand", "most_s"), [(4, 1.0, 55), (8, 0.5, 30)])
+def test_where_people_walk_nobody_late_amid_a_junction_locks_a_street_under_schedules(
+    seed: int, demand: float, most_s: float, tmp_path: Path
+) -> None:
     net = tuning_nets.write("walkers", tmp_path / "walkers")
-    result = bridge.run(scenario(net=str(net), controller="recommended", seed=seed), tmp_path / "run")
+    chosen = scenario(net=str(net), controller="recommended", seed=seed, demand=demand)
+    result = bridge.run(chosen, tmp_path / "run")
     assert_safe(result)
     assert result["teleports"] == 0
-    # Under locks 66 s and 137 s.
-    assert result["mean_delay_s"] < 60
+    # Under locks 63 s and 45 s.
+    assert result["mean_delay_s"] < most_s

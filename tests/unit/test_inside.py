@@ -25,14 +25,10 @@ class Traffic:
 
     def __init__(self) -> None:
         self.inside_veh: dict[int, float] = defaultdict(float)
-        self.standing_veh: dict[int, float] = defaultdict(float)
         self.coming_veh: dict[int, float] = defaultdict(float)
 
     def amid_veh(self, turn: int) -> float:
         return self.inside_veh[turn]
-
-    def halting_amid_veh(self, turn: int) -> float:
-        return self.standing_veh[turn]
 
     def close_veh(self, group: int) -> float:
         return self.coming_veh[group]
@@ -155,12 +151,11 @@ class Walked:
         self.first, self.then = network.junctions[0].stages
         self.traffic = Traffic()
         self.inside = Inside(network, self.traffic)
-        self.turning = _turns_with(network, self.first, "g")
+        self.late = _turns_with(network, self.first, "gG")
 
     def holds_for(self, turn: int, *groups: int) -> bool:
-        """Who turns stands before a crossing when the next road's green is to begin, others are close on these."""
-        self.traffic.standing_veh = defaultdict(float, {turn: 1.0})
-        self.traffic.inside_veh = self.traffic.standing_veh
+        """Somebody is still amid the junction when the next road's green is to begin, others are close on these."""
+        self.traffic.inside_veh = defaultdict(float, {turn: 1.0})
         self.traffic.coming_veh = defaultdict(float, dict.fromkeys(groups, 1.0))
         self.inside.leads(0, self.first, self.then, 23.0)
         return self.inside.holds(0, 23.0)
@@ -171,9 +166,11 @@ def walked(street_of: StreetOf) -> Walked:
     return Walked(street_of(odd_nets.pedestrians))
 
 
-def test_one_who_stands_before_people_holds_those_who_would_come_into_its_way(walked: Walked) -> None:
+def test_where_people_walk_one_who_is_inside_holds_those_who_would_come_into_its_way(walked: Walked) -> None:
     network = walked.network
-    for turn in walked.turning:
+    groups = range(len(network.groups))
+    assert len(walked.late) > len(_turns_with(network, walked.first, "g"))
+    for turn in walked.late:
         street = network.turns[turn].to_edge
         joins = {
             network.turns[other].group
@@ -181,7 +178,6 @@ def test_one_who_stands_before_people_holds_those_who_would_come_into_its_way(wa
             if network.turns[other].to_edge == street
         }
         assert joins
-        groups = range(len(network.groups))
         assert joins <= {group for group in groups if walked.holds_for(turn, group)}
         assert not walked.holds_for(turn, network.turns[turn].group)
         # Here too the red ends at last.
@@ -190,19 +186,18 @@ def test_one_who_stands_before_people_holds_those_who_would_come_into_its_way(wa
         assert not walked.inside.holds(0, 23.0 + MOST_HOLD_S)
 
 
-def test_nobody_is_held_for_one_who_moves_or_has_green_in_the_next_stage(walked: Walked) -> None:
+def test_nobody_is_held_for_one_who_has_left_or_has_green_in_the_next_stage(walked: Walked) -> None:
     everybody = range(len(walked.network.groups))
-    turn = walked.turning[0]
-    assert walked.holds_for(turn, *everybody)
-    walked.traffic.standing_veh = defaultdict(float)
+    assert walked.holds_for(walked.late[0], *everybody)
+    walked.traffic.inside_veh = defaultdict(float)
     assert not walked.inside.holds(0, 23.0)
-    for next_turn in _turns_with(walked.network, walked.then, "g"):
+    for next_turn in _turns_with(walked.network, walked.then, "gG"):
         assert not walked.holds_for(next_turn, *everybody)
 
 
 def test_where_no_turn_gives_way_nobody_is_ever_waited_for(utn17: Network) -> None:
     traffic = Traffic()
-    traffic.inside_veh = traffic.standing_veh = traffic.coming_veh = defaultdict(lambda: 1.0)
+    traffic.inside_veh = traffic.coming_veh = defaultdict(lambda: 1.0)
     inside = Inside(utn17, traffic)
     assert not inside.may_hold().any()
     for index, junction in enumerate(utn17.junctions):

@@ -500,12 +500,16 @@ class TestLeastGreen:
         network = street_of(odd_nets.protected_crossings)
         assert (network.least_green_s == odd_nets.CROSSING_LEAST_S).all()
 
-    def test_who_walks_has_the_plan_s(self, street_of: Callable[[Make], Network]) -> None:
+    def test_who_walks_beside_traffic_has_it_too_and_who_walks_alone_the_plan_s(
+        self, street_of: Callable[[Make], Network]
+    ) -> None:
         network = street_of(odd_nets.pedestrians)
-        walked = [any(s.state[letter] in "Gg" for letter in range(12, len(s.state))) for s in network.stages]
-        assert any(walked)
-        assert (network.least_green_s == np.where(walked, network.min_green_s, 5)).all()
-        assert (network.min_green_s[walked] == 10).all()
+        assert any("G" in stage.state[12:] for stage in network.stages)
+        assert (network.least_green_s == 5).all()
+        network = street_of(odd_nets.crossing_amid_a_street)
+        alone = np.array([not stage.turns for stage in network.stages])
+        assert alone.any()
+        assert (network.least_green_s == np.where(alone, network.min_green_s, 5)).all()
 
     def test_the_signal_heads_keep_it_and_no_more(self, utn17: Network) -> None:
         heads = Heads(utn17, lambda index, state: None)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
@@ -189,7 +188,7 @@ class _Reader:
             signal_turns = self._signal_turns(signal, turn_index)
             first = len(stages)
             walked = set(range(signal.letters)) - signal.of_vehicles
-            stages += [_stage(block, position, signal_turns, self.usual_green_s, walked) for block in programme.blocks]
+            stages += [_stage(block, position, signal_turns, self.usual_green_s) for block in programme.blocks]
             junctions.append(
                 Junction(
                     id=signal.id,
@@ -306,9 +305,7 @@ def _coming_veh(net: Any, traffic: Traffic) -> dict[tuple[str, str], float]:
     return total
 
 
-def _stage(
-    block: Block, junction: int, signal_turns: Sequence[Sequence[int]], usual_green_s: float, walked: AbstractSet[int]
-) -> Stage:
+def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]], usual_green_s: float) -> Stage:
     """A stage of a junction, with the turns that it and each part of its clearance open."""
 
     def served(phase: Phase) -> tuple[int, ...]:
@@ -320,8 +317,8 @@ def _stage(
         clearance=tuple((phase.state, phase.duration_s) for phase in block.clearance),
         turns=served(block.stage),
         min_green_s=block.min_green_s(usual_green_s),
-        # Who walks needs as long whoever decides; vehicles only need not to be startled.
-        least_green_s=block.min_green_s(usual_green_s if block.stage.green & walked else SHORT_GREEN_S),
+        # Who walks has five seconds to set out, and the clearance to arrive; a walk with no vehicles beside it lasts.
+        least_green_s=block.min_green_s(SHORT_GREEN_S if served(block.stage) else usual_green_s),
         held=tuple(served(phase) for phase in block.clearance),
     )
 

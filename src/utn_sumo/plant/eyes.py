@@ -107,12 +107,8 @@ class Eyes:
         return float(min(map(self._since_s, self._group_stop_line[group])))
 
     def amid_veh(self, turn: int) -> float:
-        """Of a turn that gives way in some stage, on the lanes amid the junction on which it waits."""
+        """Of a turn that may wait amid the junction, on its lanes there."""
         return float(sum(map(self._present, self._amid[turn])))
-
-    def halting_amid_veh(self, turn: int) -> float:
-        """Of those, who stand."""
-        return float(sum(map(self._halting, self._amid[turn])))
 
     def close_veh(self, group: int) -> float:
         """In the zones of one lane group up to CLOSE_ZONES, moving or not."""

@@ -2,9 +2,10 @@
 
 Those who found no gap in oncoming traffic have a stage of their own then, in the net's own programme. Where that one is
 left out, the next road's green finds them in its way, its own turns come to stand beside them, and when those of all
-roads wait for each other nobody ever moves again. Those who stand before people on the crossing at their exit are in
-the way of whoever turns into the same street, and what stops behind these fills the junction. So while the lane-area
-detectors amid it see such vehicles, and others are about to come into their way, the red before the next green lasts.
+roads wait for each other nobody ever moves again. Where people walk, whoever came in late is stopped amid the junction
+too, turning or not: by those who step onto the crossing at its exit with the next green, or behind one who is. So while
+the lane-area detectors amid it see such vehicles, and others are about to come into their way, the red before the next
+green lasts.
 """
 
 from __future__ import annotations
@@ -27,13 +28,12 @@ class Areas(Protocol):
     """What it takes to know who waits (plant.eyes)."""
 
     def amid_veh(self, turn: int) -> float: ...
-    def halting_amid_veh(self, turn: int) -> float: ...
     def close_veh(self, group: int) -> float: ...
 
 
 @dataclass(frozen=True)
 class Turning:
-    """A signal letter that gives way in some stage."""
+    """A signal letter that gives way to oncoming traffic in some stage."""
 
     letter: int
     turns: tuple[int, ...]
@@ -41,8 +41,6 @@ class Turning:
     """Lane groups from which it comes in."""
     oncoming: tuple[int, ...]
     """Letters of traffic that it gives way to."""
-    walked: bool
-    """It gives way to people on crossings too."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class Way:
     coming: tuple[int, ...]
     """Lane groups of turns that give way in it."""
     before_walks: tuple[tuple[int, tuple[int, ...]], ...]
-    """Turns that may stand before people who walk, each with the lane groups that come into its way."""
+    """Turns that people who walk may stop, each with the lane groups that come into its way."""
     until_s: float
     """It begins no later."""
 
@@ -71,29 +69,28 @@ class Inside:
 
     def may_hold(self) -> Bools:
         """(J,) junctions in which somebody may be left."""
-        return np.array([len(each) > 0 for each in self._turnings], dtype=np.bool_)
+        may = zip(self._turnings, self._network.junctions, strict=True)
+        return np.array([len(each) > 0 or junction.is_walked for each, junction in may], dtype=np.bool_)
 
     def leads(self, index: int, first: int, then: int, opens_s: float) -> None:
         """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`."""
-        network, turnings = self._network, self._turnings[index]
+        network, junction, turnings = self._network, self._network.junctions[index], self._turnings[index]
         becomes = network.stages[then].state
         left = [
             turn
             for each in turnings
-            if each.oncoming and not any(becomes[letter] in GREEN for letter in (each.letter, *each.oncoming))
+            if not any(becomes[letter] in GREEN for letter in (each.letter, *each.oncoming))
             for turn in each.turns
         ]
-        coming = [
-            group for each in turnings if each.oncoming and becomes[each.letter] == GIVES_WAY for group in each.groups
-        ]
+        coming = [group for each in turnings if becomes[each.letter] == GIVES_WAY for group in each.groups]
         before_walks = [
-            (turn, _into_its_way(network, network.junctions[index], each.letter, becomes))
-            for each in turnings
-            if each.walked and becomes[each.letter] not in GREEN
-            for turn in each.turns
+            (turn, _into_its_way(network, junction, letter, becomes))
+            for letter, turns in enumerate(junction.signal_turns)
+            if junction.is_walked and becomes[letter] not in GREEN
+            for turn in turns
         ]
         # To the stage that follows it is the net's own clearance, to the second, but for who walks.
-        is_own = then == following(network.junctions[index], first)
+        is_own = then == following(junction, first)
         self._ways[index] = Way(
             () if is_own else tuple(left), tuple(coming), tuple(before_walks), opens_s + MOST_HOLD_S
         )
@@ -107,7 +104,7 @@ class Inside:
         if found_no_gap and any(areas.close_veh(group) > 0 for group in way.coming):
             return True
         return any(
-            areas.halting_amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
+            areas.amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
             for turn, groups in way.before_walks
         )
 
@@ -128,9 +125,7 @@ def _turnings(network: Network, junction: Junction) -> list[Turning]:
         giving = [state for state in states if traffic[letter] and state[letter] == GIVES_WAY]
         having = {other for state in giving for other, has in enumerate(state) if has == HAS_WAY}
         oncoming = tuple(sorted(other for other in having if traffic[other] and junction.conflicts[letter][other]))
-        # The crossing at its exit is in no conflict with it (SPEC 8), others' letters that stop no traffic are of none.
-        walked = any(not traffic[other] and any(junction.conflicts[other]) for other in having)
-        if oncoming or walked:
+        if oncoming:
             groups = tuple(sorted({network.turns[turn].group for turn in turns}))
-            found.append(Turning(letter, turns, groups, oncoming, walked))
+            found.append(Turning(letter, turns, groups, oncoming))
     return found
