@@ -1,7 +1,8 @@
 """Who has green and does not go: behind a turn that finds no gap, or before a road or a junction that is full.
 
 No detector tells which. Green is lost on them, and what lets them go is often that others get it: the oncoming traffic
-has to stop for who turns left, the queue ahead to move.
+has to stop for who turns left, the queue ahead to move. Where all leave the net it can only be the first, the oncoming
+traffic makes use of the green, and the next turn would stop the queue again: others are served later then.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ import numpy as np
 
 from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 WAITING_VEH = 0.5
 """Fewer before a green than so many may be nobody."""
+FOR_A_GAP = 3.0
+"""So many times as long a queue may stand that waits for a gap while others of its junction go."""
 
 
 class Shown(Protocol):
@@ -30,7 +33,7 @@ class Shown(Protocol):
 
 
 class Standstill:
-    """Keeps when each link last sent somebody off, or had nobody standing before its green."""
+    """Keeps when each link last sent somebody off, or had nobody standing before its green, and each junction."""
 
     def __init__(self, network: Network, streams: Streams, after_s: float):
         """After so long [s] a queue that has green is at a standstill."""
@@ -38,7 +41,10 @@ class Standstill:
         self._after_s = after_s
         self._junction = network.link_junction
         self._group_link = network.group_link
+        self._all_leave = np.ones(len(network.links), dtype=np.bool_)
+        self._all_leave[network.turn_link[network.turn_next != EXIT]] = False
         self._went_s = np.zeros(len(network.links))
+        self._anybody_went_s = np.zeros(len(network.junctions))
         self._left_veh = np.zeros(len(network.links))
 
     def look(self, view: Shown, present: Ints, stand: Floats) -> Bools:
@@ -56,8 +62,10 @@ class Standstill:
                 self._streams.serves,
                 self._streams.link,
                 self._junction,
+                self._all_leave,
                 self._left_veh,
                 self._went_s,
+                self._anybody_went_s,
                 self._after_s,
             )
         )
@@ -73,8 +81,10 @@ def _look(
     serves: Bools,
     stream_link: Ints,
     junction: Ints,
+    all_leave: Bools,
     before: Floats,
     went_s: Floats,
+    anybody_went_s: Floats,
     after_s: float,
 ) -> Bools:
     waiting, stuck = np.zeros(len(left)), np.zeros(len(stand), np.bool_)
@@ -84,9 +94,13 @@ def _look(
     for link in range(len(left)):
         if left[link] > before[link] or waiting[link] < WAITING_VEH:
             went_s[link] = time_s
+        if left[link] > before[link] and waiting[link] >= WAITING_VEH:
+            anybody_went_s[junction[link]] = time_s
         before[link] = left[link]
     for stream, link in enumerate(stream_link):
         own = junction[link]
         if serves[row[own], stream]:
-            stuck[stream] = time_s - max(went_s[link], begin_s[own]) >= after_s
+            for_a_gap = all_leave[link] and time_s - anybody_went_s[own] < after_s
+            stands_s = time_s - max(went_s[link], begin_s[own])
+            stuck[stream] = stands_s >= after_s * (FOR_A_GAP if for_a_gap else 1.0)
     return stuck
