@@ -8,11 +8,10 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from tests.unit.views import scene
 from utn_sumo import clearances, monitor
 from utn_sumo.clearances import Times, between
 from utn_sumo.contract import Junction, Network
-from utn_sumo.plant.heads import LONGEST_RED_S, LOOK_S, MOST_PATIENCE_S, Heads
+from utn_sumo.plant.heads import Heads
 
 
 def ways(network: Network, junction: Junction) -> dict[tuple[int, int], clearances.Phases]:
@@ -73,52 +72,3 @@ def test_the_monitor_has_nothing_to_say_against_any_order_of_stages(utn17: Netwo
     verdict = monitor.watch(utn17, tmp_path / "signals.xml", 1200, in_order=False)
     assert verdict.reasons == []
     assert len(changes) > 100
-
-
-def test_who_waits_too_long_comes_next_and_who_does_not_wait_does_not(utn17: Network) -> None:
-    heads = Heads(utn17, lambda index, state: None)
-    for waiting, forced in ((1.0, True), (0.0, False)):
-        heads = Heads(utn17, lambda index, state: None)
-        for time_s in np.arange(0, MOST_PATIENCE_S + 5, 5):
-            now = scene(utn17, float(time_s), veh=waiting)
-            kept = heads.patient(now.stage, now)
-            if time_s < MOST_PATIENCE_S - 1:
-                assert (kept == now.stage).all()
-        assert (kept != now.stage).all() == forced
-
-
-def test_who_creeps_on_for_a_moment_waits_still_and_who_has_gone_does_not(utn17: Network) -> None:
-    for unseen_s, forced in ((LOOK_S, True), (2 * LOOK_S, False)):
-        heads = Heads(utn17, lambda index, state: None)
-        for time_s in np.arange(0, MOST_PATIENCE_S + LOOK_S, LOOK_S):
-            stands = not 60 <= time_s < 60 + unseen_s
-            now = scene(utn17, float(time_s), veh=float(stands))
-            kept = heads.patient(now.stage, now)
-        assert (kept != now.stage).all() == forced
-
-
-def test_who_has_had_green_in_one_stage_does_not_call_for_another(utn17: Network) -> None:
-    first, second, last = utn17.junctions[0].stages
-    both = replace(utn17.stages[last], turns=(*utn17.stages[last].turns, *utn17.stages[second].turns))
-    stages = tuple(both if index == last else stage for index, stage in enumerate(utn17.stages))
-    net = replace(utn17, stages=stages)
-    heads, present = Heads(net, lambda index, state: None), scene(net).stage
-    for time_s in np.arange(0, 400.0, LOOK_S):
-        # The last stage, which serves the second's traffic too, has been shown meanwhile.
-        present[0] = last if time_s == 100 else first
-        now = scene(net, float(time_s), present, veh=1.0)
-        kept = heads.patient(now.stage, now)[0]
-        assert (kept == last) == (time_s == 100 or time_s >= 100 + MOST_PATIENCE_S)
-
-
-def test_where_green_and_clearance_are_long_who_waits_comes_sooner(utn17: Network) -> None:
-    junction = utn17.junctions[0]
-    stages = [replace(stage, least_green_s=45.0) if stage.junction == 0 else stage for stage in utn17.stages]
-    heads = Heads(replace(utn17, stages=tuple(stages)), lambda index, state: None)
-    # The two others may have to be shown before.
-    sooner_s = LONGEST_RED_S - LOOK_S - 2 * (45.0 + utn17.stages[junction.stages[0]].clearance_s)
-    for time_s in np.arange(0, sooner_s + LOOK_S, LOOK_S):
-        now = scene(utn17, float(time_s), veh=1.0)
-        kept = heads.patient(now.stage, now)
-        assert (kept != now.stage)[0] == (time_s >= sooner_s)
-        assert (kept == now.stage)[1:].all()

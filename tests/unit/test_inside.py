@@ -14,8 +14,9 @@ import pytest
 from tests.integration import odd_nets
 from tests.unit.views import scene
 from utn_sumo.contract import Network
-from utn_sumo.plant.heads import LONGEST_RED_S, LOOK_S, Heads
+from utn_sumo.plant.heads import Heads
 from utn_sumo.plant.inside import MOST_HOLD_S, Inside
+from utn_sumo.plant.patience import LONGEST_RED_S, LOOK_S
 
 StreetOf = Callable[[Callable[[Path], Any]], Network]
 
@@ -131,16 +132,15 @@ def test_where_reds_may_be_drawn_out_who_waits_is_served_sooner(crossing: Crossi
     network = crossing.network
     stages = tuple(replace(stage, least_green_s=30.0) for stage in network.stages)
     slow = replace(network, stages=stages)
-    waited_s = []
+    wish, waited_s = np.array([crossing.alone]), []
     for areas in (None, crossing.traffic):
         heads = Heads(slow, lambda index, letters: None, areas)
         for time_s in np.arange(0.0, LONGEST_RED_S, LOOK_S):
-            view = scene(slow, float(time_s), veh=1.0)
-            if (heads.patient(view.stage, view) != view.stage).any():
+            if heads.patience.allow(wish, scene(slow, float(time_s), veh=1.0)) != wish:
                 waited_s.append(time_s)
                 break
-    others = len(network.junctions[0].stages) - 1
-    assert waited_s[0] - waited_s[1] == pytest.approx(others * MOST_HOLD_S, abs=LOOK_S)
+    # There and back.
+    assert waited_s[0] - waited_s[1] == pytest.approx(2 * MOST_HOLD_S, abs=LOOK_S)
 
 
 class Walked:

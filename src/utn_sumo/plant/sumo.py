@@ -264,7 +264,7 @@ class SumoPlant:
             free = heads.free(self.time_s)
             # An execution that keeps in mind who has come looks every time, though no junction may be free.
             view = Sight(self._eyes, heads, self.time_s, free)
-            wish = heads.patient(self._wish(execution, view), view)
+            wish = heads.patience.allow(self._wish(execution, view), view)
             if wish is not view.stage:
                 for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
                     heads.switch(index, int(wish[index]), self.time_s)

@@ -1,0 +1,102 @@
+"""Nobody waits too long: whatever is wished, whom the longest red threatens is served before.
+
+Who waits has a time by which green has to come. As long as all can still be served in the order of these times, each
+for the least green, a junction may stay where it is, or go where it likes and back in time; otherwise the first of
+them is next (earliest deadline first).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from utn_sumo import clearances
+from utn_sumo.contract import Bools, Floats, Ints, Network, View
+
+MOST_PATIENCE_S = 150.0
+"""Who has waited so long without green is served next, whatever is wished."""
+LONGEST_RED_S = 180.0
+"""Where least greens and clearances are long it comes next sooner: nobody is to wait longer than this."""
+LOOK_S = 5.0
+"""Time between two looks at who waits."""
+
+
+class Patience:
+    """Keeps since when somebody has been waiting for each turn, and for each crossing of those who walk."""
+
+    def __init__(self, network: Network, held_s: Floats):
+        """Stages of each junction may begin `held_s` (J,) later than the clearance before is over."""
+        self._turn_group = network.turn_group
+        self._needs = np.hstack([network.serves, _walks(network)])
+        """(S, M + walks) which turns and which letters of pedestrians each stage has green for."""
+        self._served = self._needs.any(axis=0)
+        self._junction = network.stage_junction[self._needs.argmax(axis=0)]
+        """(M + walks,) whose stages these are."""
+        self._leaves_s = network.clearance_s + held_s[network.stage_junction]
+        """(S,) from a stage's end until another one begins."""
+        self._lasts_s = network.least_green_s + self._leaves_s
+        """(S,) from a stage's begin until another one can begin."""
+        all_s = np.bincount(network.stage_junction, self._lasts_s)
+        self._carefree_s = np.clip(LONGEST_RED_S - LOOK_S - all_s, 0.0, MOST_PATIENCE_S)
+        """(J,) before somebody has waited so long all can be served, whoever they are and whatever is wished."""
+        self._since_s = np.zeros(self._needs.shape[1])
+        """(M + walks,) since when somebody has been waiting for each, without green meanwhile."""
+        self._stood = np.zeros(self._needs.shape[1], dtype=np.bool_)
+        """(M + walks,) whether somebody stood before each at the last look: who creeps on for a moment waits still."""
+        self._look_s = 0.0
+        """When it is looked again who waits."""
+        self._next: dict[int, tuple[int, float]] = {}
+        """By junction whose time may come the stage to serve first, and when it has to be led to at the latest."""
+
+    def allow(self, wish: Ints, view: View) -> Ints:
+        """(J,) the wish, but where somebody would have to wait for too long then: whom first, is served next."""
+        if view.time_s >= self._look_s:
+            self._look(view)
+            self._look_s = view.time_s + LOOK_S
+        allowed = wish
+        for junction, (first, latest_s) in self._next.items():
+            wished = wish[junction]
+            back_s = 0.0 if wished == view.stage[junction] else self._lasts_s[wished]
+            if wished != first and view.time_s + back_s + LOOK_S > latest_s:
+                allowed = wish.copy() if allowed is wish else allowed
+                allowed[junction] = first
+        return allowed
+
+    def _look(self, view: View) -> None:
+        present = view.stage[self._junction]
+        waits = np.ones(len(self._since_s), dtype=np.bool_)
+        # Pedestrians, whom no detector sees, may always be waiting.
+        waits[: len(self._turn_group)] = view.waiting_veh[self._turn_group] > 0
+        self._stood, waits = waits, waits | self._stood
+        waits &= self._served & ~self._needs[present, np.arange(len(waits))]
+        self._since_s[~waits] = view.time_s
+        troubled = waits & (self._since_s + self._carefree_s[self._junction] <= view.time_s)
+        self._next = {
+            junction: self._first(
+                int(view.stage[junction]), np.flatnonzero(waits & (self._junction == junction)), view.time_s
+            )
+            for junction in np.unique(self._junction[troubled]).tolist()
+        }
+
+    def _first(self, present: int, waiting: Ints, now_s: float) -> tuple[int, float]:
+        """The stage to serve first of those that those `waiting` need, and when it has to be led to at the latest."""
+        left = waiting[np.lexsort((-waiting, self._since_s[waiting]))]
+        is_late = self._since_s[left[0]] + MOST_PATIENCE_S <= now_s
+        latest_s, opens_s, stages = -np.inf if is_late else np.inf, self._leaves_s[present], []
+        while len(left):
+            latest_s = min(latest_s, self._since_s[left[0]] + LONGEST_RED_S - opens_s)
+            # Of those that serve whoever waits the longest: the one that most others wait for too.
+            stage = int(np.argmax(np.where(self._needs[:, left[0]], self._needs[:, left].sum(axis=1), -1)))
+            stages.append(stage)
+            left = left[~self._needs[stage, left]]
+            opens_s += self._lasts_s[stage]
+        return stages[0], float(latest_s)
+
+
+def _walks(network: Network) -> Bools:
+    """(S, walks) which letters that are no vehicles' each stage has green for."""
+    walks = [(index, letter) for index, junction in enumerate(network.junctions) for letter in junction.without_yellow]
+    green = [
+        [stage.junction == index and stage.state[letter] in clearances.GREEN for index, letter in walks]
+        for stage in network.stages
+    ]
+    return np.reshape(np.array(green, dtype=np.bool_), (len(network.stages), len(walks)))
