@@ -19,8 +19,8 @@ from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 WAITING_VEH = 0.5
 """Fewer before a green than so many may be nobody."""
-QUICK_S, MOST_TIMES = 3.0, 3.0
-"""Of a clearance: so many times as long as this takes, so many times as long may be waited for a gap, up to these."""
+QUICK_S, COSTLY_S, MOST_TIMES = 4.0, 8.0, 3.0
+"""Who may wait for a gap has no longer where clearances take so little, and so many times as long where so much."""
 ROOM = 0.3
 """A road ahead has room if less than this share of its storage is taken."""
 HOLDS_UP = 0.5
@@ -48,7 +48,7 @@ class Standstill:
         self._streams = streams
         self._after_s = after_s
         clears_s = np.bincount(network.stage_junction, network.clearance_s) / np.bincount(network.stage_junction)
-        self._gap_s = after_s * np.clip(clears_s / QUICK_S, 1.0, MOST_TIMES)
+        self._gap_s = after_s * np.interp(clears_s, (QUICK_S, COSTLY_S), (1.0, MOST_TIMES))
         """(J,)"""
         self._yields = _yields(network, streams)
         self._fed = np.zeros(len(network.links), dtype=np.bool_)
