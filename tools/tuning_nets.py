@@ -78,14 +78,20 @@ def write(name: str, folder: Path) -> Path:
     """Build a net of `TUNING_NETS` in `folder`, with its traffic; its .sumocfg. Raises UtnError."""
     chosen = TUNING_NETS[name]
     recording.new_folder(folder, "")
-    net, trips, routes, configuration = (
-        folder / f"{name}.{kind}" for kind in ("net.xml", "trips.xml", "rou.xml", "sumocfg")
-    )
+    net = folder / f"{name}.net.xml"
     words = chosen.words or _street(folder)
-    _run("netgenerate" if chosen.words else "netconvert", *words, "--no-turnarounds.fringe", "-o", str(net))
-    ET.ElementTree(_traffic(net, chosen)).write(trips)
+    run("netgenerate" if chosen.words else "netconvert", *words, "--no-turnarounds.fringe", "-o", str(net))
+    return drive(net, chosen.veh_h, chosen.walkers_h, SEED)
+
+
+def drive(net: Path, veh_h: float, walkers_h: float, seed: int) -> Path:
+    """Write traffic for NAME.net.xml, so many at the peak, beside it; its .sumocfg. Raises UtnError."""
+    trips, routes, configuration = (
+        net.with_name(net.name.replace("net.xml", kind)) for kind in ("trips.xml", "rou.xml", "sumocfg")
+    )
+    ET.ElementTree(_traffic(net, veh_h, walkers_h, seed)).write(trips)
     # Of ways that are much alike each vehicle takes its own.
-    _run("duarouter", "-n", str(net), "-r", str(trips), "-o", str(routes), "--weights.random-factor", "1.5")
+    run("duarouter", "-n", str(net), "-r", str(trips), "-o", str(routes), "--weights.random-factor", "1.5")
     root = ET.Element("configuration")
     for key, value in {"net-file": net.name, "route-files": routes.name, "begin": "0", "end": f"{WINDOW_S:g}"}.items():
         ET.SubElement(root, key, value=value)
@@ -93,8 +99,9 @@ def write(name: str, folder: Path) -> Path:
     return configuration
 
 
-def _run(binary: str, *words: str) -> None:
-    sumo_tools.run_program(binary, [str(sumo_tools.sumo_binary(binary)), *words, "--seed", str(SEED)])
+def run(binary: str, *words: str, seed: int = SEED) -> None:
+    """Run one of SUMO's binaries. Raises UtnError."""
+    sumo_tools.run_program(binary, [str(sumo_tools.sumo_binary(binary)), *words, "--seed", str(seed)])
 
 
 def _street(folder: Path) -> tuple[str, ...]:
@@ -126,17 +133,17 @@ def _street(folder: Path) -> tuple[str, ...]:
     return "-n", str(files[0]), "-e", str(files[1]), "--no-turnarounds"
 
 
-def _traffic(net: Path, chosen: TuningNet) -> ET.Element:
+def _traffic(net: Path, veh_h: float, walkers_h: float, seed: int) -> ET.Element:
     """Trips from edge to edge of the net's rim, with uneven weights that are drawn; walkers likewise."""
     import sumolib  # noqa: PLC0415 - slow
 
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(seed)
     found = sumolib.net.readNet(str(net))
     rim = sorted((edge for edge in found.getEdges() if edge.is_fringe()), key=lambda edge: str(edge.getID()))
     ends = {True: [e for e in rim if not e.getIncoming()], False: [e for e in rim if not e.getOutgoing()]}
     root = ET.Element("routes")
     departures = []
-    for kind, rate_h in (("trip", chosen.veh_h), ("person", chosen.walkers_h)):
+    for kind, rate_h in (("trip", veh_h), ("person", walkers_h)):
         weights = {side: rng.uniform(0.5, 1.5, len(edges)) for side, edges in ends.items()}
         times, shares = np.transpose(SWELL)
         count = int(rng.poisson(rate_h * np.trapezoid(shares, times) / 3600))

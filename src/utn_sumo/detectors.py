@@ -13,6 +13,7 @@ who waits amid a junction because their green gives way to others, or who is ami
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +34,8 @@ CAR_M = 5.0
 """The detector of a zone ends so much before the zone: it sees a car until its back has gone by."""
 LEAST_M = 0.1
 """Shortest detector that SUMO takes."""
+ROUNDING = 1e-6
+"""By how much a number of centimetres may be off."""
 NEARLY_M = -0.01
 """Detectors on lanes amid a junction end so much before the lane does, from where SUMO counts what is below 0."""
 
@@ -162,7 +165,9 @@ def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, f
         length_m = network.edge_length_m
         pieces = [("area", edge, length_m[edge] - seen_m, length_m[edge]) for edge, seen_m in network.watched(link)]
         for edge, zone, from_m, to_m in _zones(network, link) if within_step else ():
-            pieces.append((f"zone{zone}", edge, from_m, max(to_m - CAR_M, from_m + LEAST_M)))
+            # Less of a zone than that on an edge begins before the zone does.
+            begin_m = max(min(from_m, length_m[edge] - LEAST_M), 0.0)
+            pieces.append((f"zone{zone}", edge, begin_m, max(to_m - CAR_M, begin_m + LEAST_M)))
         for kind, edge, from_m, to_m in pieces:
             for lane in network.edge_lanes[edge]:
                 yield kind, f"{edge}_{lane}", from_m, to_m
@@ -181,10 +186,15 @@ def write(network: Network, path: Path, period_s: float, *, within_step: bool = 
         place = {"lane": lane, "pos": f"{position_m:g}"}
         ET.SubElement(root, "inductionLoop", {"id": _named(kind, lane), **place, **report})
     for kind, lane, from_m, to_m in _areas(network, within_step=within_step):
-        place = {"lane": lane, "pos": f"{from_m:g}", "endPos": f"{to_m:g}"}
+        place = {"lane": lane, "pos": _metres(from_m), "endPos": _metres(to_m)}
         ET.SubElement(root, "laneAreaDetector", {"id": _named(kind, lane), **place, **report})
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+
+
+def _metres(position_m: float) -> str:
+    """A position in centimetres, never rounded up: SUMO takes none beyond a lane's end, by however little."""
+    return f"{math.floor(100 * position_m + ROUNDING) / 100:.12g}"
 
 
 class Miscount:

@@ -605,6 +605,18 @@ def stubs(folder: Path) -> Path:
     return case(folder, traffic("AB") + more)
 
 
+def nodes_beside_zone_ends(folder: Path) -> Path:
+    """Nodes a few centimetres nearer to the stop line than zones end, and lengths in tenths of millimetres."""
+    streets = row("C").without("W-C", "E-C")
+    for start, node, x, before_m, after_m in (("W", "w", -50, 1234.5678, 49.96), ("E", "e", 22, 1e4 + 0.0678, 21.9712)):
+        streets.node(node, x, 0)
+        streets.one_way(start, node, length=before_m)
+        streets.one_way(node, "C", length=after_m)
+    streets.net(folder, NO_TURNAROUNDS, "--precision", "4")
+    flows = flow("right", "W-w", "C-E") + flow("left", "E-e", "C-W") + flow("south", "nC-C", "C-sC")
+    return case(folder, flows)
+
+
 def names_as_in_openstreetmap(folder: Path) -> Path:
     """Ids with signs, hashes, slashes and brackets in them, and a letter beyond ASCII."""
     net = row("C").net(folder, NO_TURNAROUNDS)
@@ -812,6 +824,7 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     dead_ends,
     left_hand,
     stubs,
+    nodes_beside_zone_ends,
     names_as_in_openstreetmap,
     zipped,
     sundry_trips,
