@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.compiling import compiled
 from utn_controllers.mpc.agent import NOWHERE, gram
 from utn_controllers.mpc.ldl import Factorisation, factorise, substitute
 from utn_controllers.mpc.problem import Programs
 from utn_controllers.mpc.receding import RecedingProblem
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import Floats, Forecast, Ints, State
 from utn_sumo.errors import ControllerError
 

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from utn_controllers.compiling import compiled
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints
 
 

@@ -93,6 +93,17 @@ class Timing:
         return cls(windows.shown_s / green_s, windows.held_s, windows.end_s, opening, delay_s)
 
     @classmethod
+    def anywhere(cls, model: LinkModel, green_s: Floats, delay_s: Floats | None = None) -> Timing:
+        """The timing where an execution shows as much green, but in short pieces whenever it likes.
+
+        Every model step has its share of it, nobody arrives too late for the last piece, and room is let out evenly.
+        """
+        placed = cls.of(model, green_s, delay_s)
+        end_s = np.full_like(placed.end_s, model.step_s)
+        shown, held_s = (np.broadcast_to(each.mean(axis=0), each.shape) for each in (placed.shown, placed.held_s))
+        return cls(shown, held_s, end_s, model.opening(end_s, end_s), delay_s)
+
+    @classmethod
     def joined(cls, timings: Sequence[Timing], places: Sequence[Place]) -> Timing:
         """The whole network's timing from its parts'."""
         links, turns, stages = (

@@ -30,7 +30,8 @@ class RecedingProblem:
 
     def timing(self) -> Timing:
         """What the next programme is frozen at."""
-        return Timing.of(self.problem.model, np.maximum(self._expected_s, LEAST_EXPECTED_S), self._delay_s)
+        found = Timing.of if self.problem.settings.greens == "placed" else Timing.anywhere
+        return found(self.problem.model, np.maximum(self._expected_s, LEAST_EXPECTED_S), self._delay_s)
 
     def programs(self, state: State, forecast: Forecast) -> Programs:
         """The programmes of the junctions' own state, for the coming steps."""

@@ -6,9 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.pockets import held_up, rooms_veh
 from utn_controllers.scheduled.streams import Streams
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
 
 MEMORY_S = 120.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.compiling import compiled
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import Floats, Ints, Network
 
 HOLDING = (0.35, 0.45), (0.08, 0.12)

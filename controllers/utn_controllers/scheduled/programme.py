@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.moves import Rules
 from utn_controllers.scheduled.traffic import Traffic
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints
 
 NEVER = 1e18

@@ -12,9 +12,9 @@ from typing import Protocol
 
 import numpy as np
 
-from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 WAITING_VEH = 0.5
@@ -69,8 +69,10 @@ class Standstill:
                 view.time_s,
                 present,
                 view.begin_s,
-                np.bincount(self._group_link, view.left_veh, len(self._left_veh)),
-                view.x_veh / self._storage_veh,
+                view.left_veh,
+                self._group_link,
+                view.x_veh,
+                self._storage_veh,
                 stand,
                 self._streams.serves,
                 self._streams.link,
@@ -101,8 +103,10 @@ def _look(
     time_s: float,
     row: Ints,
     begin_s: Floats,
-    left: Floats,
-    taken: Floats,
+    group_left: Floats,
+    group_link: Ints,
+    x: Floats,
+    storage: Floats,
     stand: Floats,
     serves: Bools,
     stream_link: Ints,
@@ -115,6 +119,9 @@ def _look(
     after_s: float,
     gap_s: Floats,
 ) -> Bools:
+    left, taken = np.zeros(len(x)), x / storage
+    for group, link in enumerate(group_link):
+        left[link] += group_left[group]
     waiting, stuck = np.zeros(len(left)), np.zeros(len(stand), np.bool_)
     for_a_gap = np.empty(len(left), np.bool_)
     for link in range(len(left)):

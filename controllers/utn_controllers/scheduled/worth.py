@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.pockets import rooms_veh
 from utn_controllers.scheduled.streams import Streams
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 FADING = 0.2
@@ -31,6 +31,7 @@ class Worth:
     ):
         self._network, self._streams = network, streams
         self._settings = crowding, blocking, starving, full
+        self._group_junction = network.link_junction[network.group_link]
         group_veh, before_veh = rooms_veh(network)
         self._room = group_veh, before_veh
         self._dense = np.zeros(len(network.groups))
@@ -60,24 +61,24 @@ class Worth:
         """
         network, streams = self._network, self._streams
         _lasting(
-            time_s, asked[network.link_junction[network.group_link]], network.group_link, *zones, *self._room,
+            time_s, asked, self._group_junction, network.group_link, *zones, *self._room,
             shares[1], self._dense, self._looked_s, self._empty_s,
         )  # fmt: skip
         worth, moving = _worth(
-            x / network.storage_veh, self._dense, network.begins_amid, streams.link, streams.group, streams.next_link,
-            shares[0], most, stuck, held, time_s - self._empty_s, *self._settings,
+            x, network.storage_veh, self._dense, network.begins_amid, streams.link, streams.group, streams.next_link,
+            shares[0], most, stuck, held, time_s, self._empty_s, *self._settings,
         )  # fmt: skip
         return worth, moving
 
 
 @compiled
 def _lasting(
-    time_s: float, asked: Bools, group_link: Ints, zone: Floats, upstream: Floats, room: Floats, before: Floats,
-    share: Floats, dense: Floats, looked_s: Floats, empty_s: Floats,
+    time_s: float, asked: Bools, group_junction: Ints, group_link: Ints, zone: Floats, upstream: Floats, room: Floats,
+    before: Floats, share: Floats, dense: Floats, looked_s: Floats, empty_s: Floats,
 ) -> None:  # fmt: skip
     """Brings `dense` (G,) and `empty_s` (G,) up to date where somebody has looked."""
     for group, link in enumerate(group_link):
-        if asked[group]:
+        if asked[group_junction[group]]:
             veh = zone[group].sum() + share[group] * upstream[link].sum()
             now = min(veh / max(room[group] + share[group] * before[link], 1.0), 1.0)
             dense[group] += (1 - np.exp((looked_s[group] - time_s) / LASTING_S)) * (now - dense[group])
@@ -94,11 +95,11 @@ def _lasts(dense: Floats) -> Floats:
 
 @compiled
 def _worth(
-    taken: Floats, dense: Floats, amid: Bools, links: Ints, groups: Ints, next_links: Ints, of_link: Floats,
-    most: Floats, stuck: Bools, held: Floats, unserved_s: Floats, crowding: float, blocking: float, starving: float,
-    full: float,
+    x: Floats, storage: Floats, dense: Floats, amid: Bools, links: Ints, groups: Ints, next_links: Ints,
+    of_link: Floats, most: Floats, stuck: Bools, held: Floats, time_s: float, empty_s: Floats, crowding: float,
+    blocking: float, starving: float, full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    queue = _lasts(dense)
+    queue, taken = _lasts(dense), x / storage
     # Where nobody sees who waits behind a link, its own vehicles say it.
     feeding, behind = amid.astype(np.float64), amid * _lasts(np.minimum(taken, 1.0))
     for stream, ahead in enumerate(next_links):
@@ -113,7 +114,7 @@ def _worth(
         blocks = queue[groups[stream]] * behind[link] / feeding[link] if feeding[link] > 0 else 0.0
         value = max(1 + crowding * (taken[link] - there) + blocking * blocks, LEAST_WORTH)
         # With queues enough for the best stages there are others that would never be worth their clearance.
-        starved = min(unserved_s[groups[stream]] / STARVED_S, 1.0)
+        starved = min((time_s - empty_s[groups[stream]]) / STARVED_S, 1.0)
         worth[stream] = held[groups[stream]] * (1 + starving * starved) * value
         fed = (full + FADING / 2 - there) / FADING
         if fed < 1:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.compiling import compiled
 from utn_controllers.scheduled.standstill import Shown
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
 START_S = 3.0

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
-from itertools import chain
+from functools import cached_property, partial
+from itertools import chain, compress
 from typing import Any
 
 import numpy as np
 
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.heads import Heads
@@ -30,35 +31,37 @@ class Eyes:
         # Detectors of a lane group, then of a link before its lanes part.
         junction = np.concatenate([network.link_junction[network.group_link], network.link_junction])
         self._is_shared = any(ids.upstream)
-        self._areas = _Detectors([*ids.group, *ids.upstream], junction)
-        self._zones = _Detectors(
+        detectors = partial(_Detectors, junctions=len(network.junctions))
+        self._areas = detectors([*ids.group, *ids.upstream], junction)
+        self._zones = detectors(
             list(chain.from_iterable([*ids.group_zone, *ids.upstream_zone])), np.repeat(junction, len(ZONES_M))
         )
-        self._entries = _Detectors(
+        self._entries = detectors(
             [(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)], network.link_junction
         )
         # Counted at the stop line: who changes lanes just there is missed now and then, but loops are half as many.
-        self._exits = _Detectors([*ids.group_stop_line, *ids.parting], junction)
+        self._exits = detectors([*ids.group_stop_line, *ids.parting], junction)
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
         self._amid = ids.amid
         self._group_close = [list(chain.from_iterable(zones[:CLOSE_ZONES])) for zones in ids.group_zone]
         self._step_s = network.control_step_s
-        self._halting = _bare(sumo, "lanearea", "getLastStepHaltingNumber")
-        self._present = _bare(sumo, "lanearea", "getLastStepVehicleNumber")
-        self._counted = _bare(sumo, "inductionloop", "getIntervalVehicleNumber")
-        self._counted_last = _bare(sumo, "inductionloop", "getLastIntervalVehicleNumber")
-        self._since_s = _bare(sumo, "inductionloop", "getTimeSinceDetection")
+        self._halting = bare(sumo, "lanearea", "getLastStepHaltingNumber")
+        self._present = bare(sumo, "lanearea", "getLastStepVehicleNumber")
+        self._counted = bare(sumo, "inductionloop", "getIntervalVehicleNumber")
+        self._counted_last = bare(sumo, "inductionloop", "getLastIntervalVehicleNumber")
+        self._since_s = bare(sumo, "inductionloop", "getTimeSinceDetection")
         self._x_veh = np.zeros(self._links)
         """(Z,) vehicles on each link when the control step began."""
         self._entered_veh = np.zeros(self._links)
         self._left_veh = np.zeros(self._groups)
         """(Z,) vehicles that had come onto each link by then, (G,) that had crossed each lane group's stop line."""
+        self._warm_up()
 
     def begin(self, time_s: float, x_veh: Floats) -> None:
         """A control step begins, with so many vehicles on each link (Z,)."""
-        self._x_veh = x_veh
+        self._x_veh = np.array(x_veh, dtype=np.float64)
         if time_s > 0:
             self._entered_veh = self._entered_veh + self._entries.read(self._counted_last)
             self._left_veh = self._left_veh + self._exits.read(self._counted_last)[: self._groups]
@@ -76,25 +79,18 @@ class Eyes:
         veh = self._zones.read(self._present, junctions).reshape(-1, len(ZONES_M))
         return veh[: self._groups], veh[self._groups :]
 
-    def crossed_veh(self, time_s: float) -> tuple[Floats, Floats, Floats]:
-        """What has been counted since the control step began.
+    def counted_veh(self, time_s: float) -> tuple[Floats, Floats, Floats]:
+        """What has been counted by now.
 
-        (Z,) who has come onto each link, (G,) left over each lane group's stop line, (Z,) left each link amid it.
+        (Z,) vehicles on each link, (Z,) that have come onto it and (G,) left over stop lines since the run began.
         """
         if time_s % self._step_s == 0:
-            return np.zeros(self._links), np.zeros(self._groups), np.zeros(self._links)
-        left = self._exits.read(self._counted)
-        return self._entries.read(self._counted), left[: self._groups], left[self._groups :]
-
-    def total_veh(self, crossed_veh: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats]:
-        """(Z,) that have come onto each link, (G,) that have left over stop lines since the run began."""
-        return self._entered_veh + crossed_veh[0], self._left_veh + crossed_veh[1]
-
-    def now_veh(self, crossed_veh: tuple[Floats, Floats, Floats]) -> Floats:
-        """(Z,) vehicles on each link after so many have come and left in this control step."""
-        came, over, parted = crossed_veh
-        left = np.bincount(self._group_link, over, self._links) + parted
-        return np.asarray(np.maximum(self._x_veh + came - left, 0.0))
+            return np.maximum(self._x_veh, 0.0), self._entered_veh, self._left_veh
+        came, left = self._entries.read(self._counted), self._exits.read(self._counted)
+        counted: tuple[Floats, Floats, Floats] = _counted(
+            came, left, self._x_veh, self._entered_veh, self._left_veh, self._group_link
+        )
+        return counted
 
     def near_one_veh(self, group: int) -> float:
         """In the lane-area detectors of one lane group, moving or not."""
@@ -114,6 +110,12 @@ class Eyes:
         """In the zones of one lane group up to CLOSE_ZONES, moving or not."""
         return float(sum(map(self._present, self._group_close[group])))
 
+    def _warm_up(self) -> None:
+        """Have the machine code made now, not at the first decision."""
+        self._entries.read(lambda _: 0)
+        left = np.zeros(self._groups + self._links)
+        _counted(self._x_veh, left, self._x_veh, self._entered_veh, self._left_veh, self._group_link)
+
     def _by_group(self, veh: Floats) -> Floats:
         """(G,) counts by lane group, of (G + Z,) with those before the lanes part, shared out as traffic is."""
         own = veh[: self._groups]
@@ -125,28 +127,54 @@ class Eyes:
 class _Detectors:
     """Detectors whose counts add up by place: by link, by lane group, or by zone of it."""
 
-    def __init__(self, names: Sequence[Sequence[str]], junction: Ints):
-        """`names` of those at each place, before which `junction` it is."""
+    def __init__(self, names: Sequence[Sequence[str]], junction: Ints, junctions: int):
+        """`names` of those at each place, before which `junction` of so many it is."""
         self._places = len(names)
         order = np.argsort(junction, kind="stable")
         counts = np.array([len(names[place]) for place in order], dtype=np.int64)
         self._place = np.repeat(order, counts)
         self._names = list(chain.from_iterable(names[place] for place in order))
-        ends = np.cumsum(np.bincount(junction[order], counts)).astype(np.int64).tolist()
-        self._parts = [
-            (self._names[begin:end], [0] * (end - begin)) for begin, end in zip([0, *ends[:-1]], ends, strict=True)
-        ]
-        """Of each junction the names of its detectors, and as many that see nobody."""
+        self._junction = np.repeat(junction[order], counts)
+        ends = np.cumsum(np.bincount(self._junction, minlength=junctions)).tolist()
+        self._of_junction = [self._names[begin:end] for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
+        self._everywhere = np.ones(junctions, dtype=np.bool_)
 
     def read(self, getter: Any, junctions: Bools | None = None) -> Floats:
         """(places,) what a getter has; of `junctions` (J,) alone if they are said, 0 elsewhere."""
-        if junctions is None:
-            seen = list(map(getter, self._names))
-        else:
-            seen = []
-            for asked, (names, nobody) in zip(junctions.tolist(), self._parts, strict=True):
-                seen += map(getter, names) if asked else nobody
-        return np.asarray(np.bincount(self._place, seen, self._places), dtype=float)
+        names = self._names
+        if junctions is not None:
+            names = list(chain.from_iterable(compress(self._of_junction, junctions.tolist())))
+        seen = np.fromiter(map(getter, names), np.float64, len(names))
+        veh: Floats = _added(
+            seen, self._junction, self._everywhere if junctions is None else junctions, self._place, self._places
+        )
+        return veh
+
+
+@compiled
+def _added(seen: Floats, junction: Ints, asked: Bools, place: Ints, places: int) -> Floats:
+    """(places,) sums of what was `seen`, one after the other by the detectors before the junctions `asked` (J,).
+
+    Of all detectors `junction` says before which each is, `place` where it counts.
+    """
+    veh, nth = np.zeros(places), 0
+    for detector in range(len(place)):
+        if asked[junction[detector]]:
+            veh[place[detector]] += seen[nth]
+            nth += 1
+    return veh
+
+
+@compiled
+def _counted(
+    came: Floats, left: Floats, x: Floats, entered: Floats, over: Floats, group_link: Ints
+) -> tuple[Floats, Floats, Floats]:
+    """As Eyes.counted_veh, by who has `left` (G + Z,) over stop lines and amid links since the control step began."""
+    groups = len(over)
+    now, total = x + came - left[groups:], over + left[:groups]
+    for group, link in enumerate(group_link):
+        now[link] -= left[group]
+    return np.maximum(now, 0.0), entered + came, total
 
 
 class Sight:
@@ -172,31 +200,27 @@ class Sight:
         """(G,) in the lane-area detectors, moving or not, by lane group."""
         return self._eyes.near_veh()
 
-    @cached_property
+    @property
     def x_veh(self) -> Floats:
         """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
-        return self._eyes.now_veh(self._crossed_veh)
+        return self._counted_veh[0]
 
     @property
     def entered_veh(self) -> Floats:
         """(Z,) vehicles that have come onto each link since the run began, but for who starts on it."""
-        return self._total_veh[0]
+        return self._counted_veh[1]
 
     @property
     def left_veh(self) -> Floats:
         """(G,) vehicles that have left over the stop line of each lane group since the run began."""
-        return self._total_veh[1]
+        return self._counted_veh[2]
 
     @cached_property
-    def _crossed_veh(self) -> tuple[Floats, Floats, Floats]:
-        return self._eyes.crossed_veh(self.time_s)
-
-    @cached_property
-    def _total_veh(self) -> tuple[Floats, Floats]:
-        return self._eyes.total_veh(self._crossed_veh)
+    def _counted_veh(self) -> tuple[Floats, Floats, Floats]:
+        return self._eyes.counted_veh(self.time_s)
 
 
-def _bare(sumo: Any, domain: str, getter: str) -> Any:
-    """A getter of libsumo, without the function in Python about it where there is one: half of a reading's time."""
+def bare(sumo: Any, domain: str, getter: str) -> Any:
+    """A function of libsumo, without the one in Python about it where there is one: half of a reading's time."""
     module = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
     return getattr(module, f"{domain}_{getter}", None) or getattr(getattr(sumo, domain), getter)

@@ -67,7 +67,7 @@ class Heads:
 
     def free(self, now_s: float) -> Bools:
         """(J,) junctions whose stage has had its least green: they may go on to another."""
-        return np.asarray(now_s >= self._ready_s)
+        return now_s >= self._ready_s
 
     def switch(self, index: int, stage: int, now_s: float) -> None:
         """Lead a junction that is free to another of its stages."""

@@ -53,8 +53,6 @@ class Way:
     """Lane groups of turns that give way in it."""
     before_walks: tuple[tuple[int, tuple[int, ...]], ...]
     """Turns that people who walk may stop, each with the lane groups that come into its way."""
-    until_s: float
-    """It begins no later."""
 
 
 class Inside:
@@ -64,8 +62,10 @@ class Inside:
         self._network = network
         self._areas = areas
         self._turnings = [_turnings(network, junction) for junction in network.junctions]
-        self._ways: dict[int, Way] = {}
-        """On which each junction came to its present stage."""
+        self._known: dict[tuple[int, int, int], Way] = {}
+        """By junction and its stages from which and to which they lead."""
+        self._ways: dict[int, tuple[Way, float]] = {}
+        """On which each junction came to its present stage, and when that begins at the latest."""
 
     def may_hold(self) -> Bools:
         """(J,) junctions in which somebody may be left."""
@@ -74,6 +74,11 @@ class Inside:
 
     def leads(self, index: int, first: int, then: int, opens_s: float) -> None:
         """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`."""
+        if (index, first, then) not in self._known:
+            self._known[index, first, then] = self._way(index, first, then)
+        self._ways[index] = self._known[index, first, then], opens_s + MOST_HOLD_S
+
+    def _way(self, index: int, first: int, then: int) -> Way:
         network, junction, turnings = self._network, self._network.junctions[index], self._turnings[index]
         becomes = network.stages[then].state
         left = [
@@ -91,14 +96,12 @@ class Inside:
         ]
         # To the stage that follows it is the net's own clearance, to the second, but for who walks.
         is_own = then == following(junction, first)
-        self._ways[index] = Way(
-            () if is_own else tuple(left), tuple(coming), tuple(before_walks), opens_s + MOST_HOLD_S
-        )
+        return Way(() if is_own else tuple(left), tuple(coming), tuple(before_walks))
 
     def holds(self, index: int, now_s: float) -> bool:
         """Whether the stage that a junction is led to has to wait for somebody."""
-        way, areas = self._ways[index], self._areas
-        if now_s >= way.until_s:
+        (way, until_s), areas = self._ways[index], self._areas
+        if now_s >= until_s:
             return False
         found_no_gap = sum(areas.amid_veh(turn) for turn in way.left) > ALONE_VEH
         if found_no_gap and any(areas.close_veh(group) > 0 for group in way.coming):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from utn_sumo import clearances
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints, Network, View
 
 MOST_PATIENCE_S = 150.0
@@ -46,6 +47,7 @@ class Patience:
         """When it is looked again who waits."""
         self._next: dict[int, tuple[int, float]] = {}
         """By junction whose time may come the stage to serve first, and when it has to be led to at the latest."""
+        self._warm_up(network)
 
     def allow(self, wish: Ints, view: View) -> Ints:
         """(J,) the wish, but where somebody would have to wait for too long then: whom first, is served next."""
@@ -62,20 +64,24 @@ class Patience:
         return allowed
 
     def _look(self, view: View) -> None:
-        present = view.stage[self._junction]
-        waits = np.ones(len(self._since_s), dtype=np.bool_)
-        # Pedestrians, whom no detector sees, may always be waiting.
-        waits[: len(self._turn_group)] = view.waiting_veh[self._turn_group] > 0
-        self._stood, waits = waits, waits | self._stood
-        waits &= self._served & ~self._needs[present, np.arange(len(waits))]
-        self._since_s[~waits] = view.time_s
-        troubled = waits & (self._since_s + self._carefree_s[self._junction] <= view.time_s)
+        waits, troubled = _look(
+            view.time_s, view.stage, view.waiting_veh, self._turn_group, self._needs, self._served, self._junction,
+            self._carefree_s, self._stood, self._since_s,
+        )  # fmt: skip
         self._next = {
             junction: self._first(
                 int(view.stage[junction]), np.flatnonzero(waits & (self._junction == junction)), view.time_s
             )
-            for junction in np.unique(self._junction[troubled]).tolist()
+            for junction in troubled.nonzero()[0].tolist()
         }
+
+    def _warm_up(self, network: Network) -> None:
+        """Have the machine code made now, not at the first look."""
+        stage = np.array([junction.stages[0] for junction in network.junctions], dtype=np.int64)
+        _look(
+            0.0, stage, np.zeros(len(network.groups)), self._turn_group, self._needs, self._served, self._junction,
+            self._carefree_s, self._stood.copy(), self._since_s.copy(),
+        )  # fmt: skip
 
     def _first(self, present: int, waiting: Ints, now_s: float) -> tuple[int, float]:
         """The stage to serve first of those that those `waiting` need, and when it has to be led to at the latest."""
@@ -90,6 +96,26 @@ class Patience:
             left = left[~self._needs[stage, left]]
             opens_s += self._lasts_s[stage]
         return stages[0], float(latest_s)
+
+
+@compiled
+def _look(
+    time_s: float, stage: Ints, waiting: Floats, turn_group: Ints, needs: Bools, served: Bools, junction: Ints,
+    carefree_s: Floats, stood: Bools, since_s: Floats,
+) -> tuple[Bools, Bools]:  # fmt: skip
+    """(M + walks,) who waits without green, (J,) where somebody's time may come; keeps `stood` and `since_s`."""
+    waits, troubled = np.zeros(len(since_s), np.bool_), np.zeros(len(carefree_s), np.bool_)
+    for each in range(len(since_s)):
+        # Pedestrians, whom no detector sees, may always be waiting.
+        stands = each >= len(turn_group) or waiting[turn_group[each]] > 0
+        is_red = served[each] and not needs[stage[junction[each]], each]
+        waits[each] = (stands or stood[each]) and is_red
+        stood[each] = stands
+        if not waits[each]:
+            since_s[each] = time_s
+        elif since_s[each] + carefree_s[junction[each]] <= time_s:
+            troubled[junction[each]] = True
+    return waits, troubled
 
 
 def _walks(network: Network) -> Bools:
