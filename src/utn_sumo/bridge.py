@@ -66,7 +66,7 @@ def run(
     net = streets.named(scenario.net) if chosen is None else streets.controllable(chosen)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
-    controller = controllers.build(scenario.controller, known, scenario.controller_settings, scenario.execution)
+    controller = controllers.build(scenario.controller, known, scenario.controller_settings)
     carried_out, execution = controllers.build_execution(scenario, known, controller)
     step_s, duration_s = net.control_step_s, scenario.duration_s
     if chosen is not None and chosen.end_s is not None:

@@ -685,8 +685,7 @@ class Execution(Protocol):
 class Controller(Protocol):
     """Whatever chooses greens once a control step.
 
-    A controller is built as `Class(network, **settings)`. One whose settings depend on what carries its plans out has a
-    class method `settings_under(execution)` of that execution's name, whose settings hold where the user says none.
+    A controller is built as `Class(network, **settings)`.
     """
 
     horizon: int

@@ -58,12 +58,9 @@ def registered(kind: Kind = CONTROLLER) -> dict[str, EntryPoint]:
     return {point.name: point for point in sorted(entry_points(group=kind.group), key=lambda point: point.name)}
 
 
-def build(name: str, network: Network, settings: dict[str, Any], execution: str | None = None) -> Controller:
-    """The controller called `name`, built for `network` and for plans that an `execution` carries out.
-
-    Raises ControllerError or SettingError.
-    """
-    found: Controller = _built(CONTROLLER, name, network, settings, execution or EXACT)
+def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
+    """The controller called `name`, built for `network`. Raises ControllerError or SettingError."""
+    found: Controller = _built(CONTROLLER, name, network, settings)
     return found
 
 
@@ -91,12 +88,8 @@ def _name_of(execution: Execution) -> str:
     return next(names, type(execution).__qualname__)
 
 
-def _built(kind: Kind, name: str, network: Network, settings: dict[str, Any], execution: str = EXACT) -> Any:
-    factory = maker(name, kind)
-    suited = getattr(factory, "settings_under", None)
-    if suited is not None:
-        settings = {**suited(execution), **settings}
-    found = made(name, factory, settings, network, noun=kind.noun)
+def _built(kind: Kind, name: str, network: Network, settings: dict[str, Any]) -> Any:
+    found = made(name, maker(name, kind), settings, network, noun=kind.noun)
     if not isinstance(found, kind.contract):
         raise ControllerError(f"{kind.noun} {name!r} lacks {kind.needs}: see contract.{kind.noun.capitalize()}")
     return found

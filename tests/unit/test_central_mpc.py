@@ -204,9 +204,10 @@ def test_who_pays_for_storage_stays_within_it(utn17: Network) -> None:
         assert solution[problem.layout.over_storage].max(initial=0) < 1e-3
 
 
-def test_settings_that_contradict_each_other_are_refused_in_a_line(utn17: Network) -> None:
+@pytest.mark.parametrize("beside", [{"constraints": "dropped"}, {"greens": "anywhere"}])
+def test_settings_that_contradict_each_other_are_refused_in_a_line(utn17: Network, beside: dict[str, str]) -> None:
     with pytest.raises(SettingError, match="leave one of the two settings out"):
-        build("cmpc", utn17, {"transcription": "nlp", "constraints": "dropped"})
+        build("cmpc", utn17, {"transcription": "nlp", **beside})
 
 
 def test_the_exact_transcription_plans_step_after_step(utn17: Network) -> None:

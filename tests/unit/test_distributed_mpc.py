@@ -281,6 +281,36 @@ def test_the_green_is_expected_where_the_last_plan_foresaw_it(utn17: Network) ->
         foreseen = all_greens(ask(mpc))[1]
 
 
+@pytest.mark.parametrize("step_s", [120.0, 60.0, 30.0])
+def test_green_that_may_stand_anywhere_is_as_much_and_nobody_comes_too_late_for_it(
+    utn17: Network, step_s: float
+) -> None:
+    rng, model = np.random.default_rng(7), LinkModel(utn17, step_s)
+    green = random_greens(utn17, rng)
+    placed, anywhere = Timing.of(model, green), Timing.anywhere(model, green)
+    assert anywhere.shown.sum(axis=0) == pytest.approx(placed.shown.sum(axis=0))
+    assert np.ptp(anywhere.shown, axis=0) == pytest.approx(0, abs=1e-12)
+    demand = np.zeros((3, 17))
+    demand[0] = 12.0 * utn17.is_source
+    problems = problems_of(utn17, 3, step_s=step_s)
+    _, solutions = optimum(problems, quiet_state(utn17), Forecast(demand), anywhere)
+    # The first vehicles that come from outside leave as soon as they have driven up: in shares of a model step.
+    late = utn17.free_time_s / step_s
+    came = np.interp(np.arange(1, 121 / step_s) - late[:, None], (0, 120 / step_s), (0, 12))
+    for problem, solution in zip(problems, solutions, strict=True):
+        left = solution[problem.layout.leaving][: len(came.T)].cumsum(axis=0).T
+        for turn, total in zip(problem.place.turns, left, strict=True):
+            if utn17.is_source[utn17.turn_link[turn]]:
+                assert total == pytest.approx(utn17.fraction[turn] * came[utn17.turn_link[turn]], abs=0.02)
+
+
+def test_a_controller_that_is_told_so_expects_green_anywhere(utn17: Network) -> None:
+    model = LinkModel(utn17, 120.0)
+    expected = Timing.anywhere(model, equal_s(utn17))
+    assert DistributedMPC(utn17, greens="anywhere").timing().end_s == pytest.approx(expected.end_s)
+    assert not np.allclose(DistributedMPC(utn17).timing().end_s, expected.end_s)
+
+
 @given(seed=SEEDS)
 @limits(max_examples=3)
 def test_every_problem_is_convex(any_net: Network, cost: str, seed: int) -> None:

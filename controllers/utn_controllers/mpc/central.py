@@ -29,6 +29,9 @@ class CentralSettings(ProblemSettings):
         if self.transcription == "nlp" and self.constraints == "dropped":
             message = "constraints can be dropped from the convex transcription only: leave one of the two settings out"
             raise ValueError(message)
+        if self.transcription == "nlp" and self.greens == "anywhere":
+            message = "greens may stand anywhere in the convex transcription only: leave one of the two settings out"
+            raise ValueError(message)
         return self
 
 

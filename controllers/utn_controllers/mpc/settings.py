@@ -22,8 +22,8 @@ class ProblemSettings(BaseModel):
     step_s: float | None = Field(None, gt=0)
     """Step of the prediction's model; a divisor of the control step, by default all of it."""
     greens: Literal["placed", "anywhere"] = "placed"
-    """Where a plan's green stands in the control step: where the plan has it, or in pieces anywhere, as it does under
-    executions that go their own way."""
+    """Where a plan's green stands in the control step: where the plan has it, or in pieces anywhere, as executions that
+    go their own way show it. Under these too `placed` has brought less delay (docs/schedules.md)."""
     cost: Literal["tts", "paper"] = "tts"
     constraints: Literal["kept", "dropped"] = "kept"
     """Whether greens must fill their cycles and keep their least, and links their storage; what dropping them costs."""
