@@ -16,8 +16,9 @@ from pydantic import ValidationError
 from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
+from utn_controllers.scheduled.ending import Ending, lost, needing, staying
 from utn_controllers.scheduled.execution import Scheduled
-from utn_controllers.scheduled.moves import Moves, Rules, going, staying
+from utn_controllers.scheduled.moves import Moves, Rules, going
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import EXIT, Floats, Ints, Network
@@ -47,6 +48,8 @@ class Crossing:
     """Share of its discharge that a stream has in another's stage."""
     staying: float = 5.0
     """Bins that who is left at the end waits longer."""
+    needing: tuple[float, ...] = ()
+    """(N,) what each of these weighs beside that: else nothing."""
 
     def green(self) -> Floats:
         """(S, N) share of its discharge that each stream has in each stage."""
@@ -54,6 +57,11 @@ class Crossing:
         for (stage, stream), slow in self.slowly.items():
             share[stage, stream] = max(slow, share[stage, stream])
         return share
+
+    def ends(self, worth: object) -> Floats:
+        """(N,) what a vehicle weighs that is left at the end."""
+        of_each = self.staying * np.array(worth, dtype=float)
+        return np.zeros(len(self.clearance)) + of_each + (np.array(self.needing) if self.needing else 0.0)
 
     def cleared(self, stage: int, other: int) -> Floats:
         """(bins, N) what moves in the clearance from a stage to another."""
@@ -74,8 +82,7 @@ class Crossing:
                 moves = np.vstack([moves, shares])
         first = np.array([0, stages])
         who = going(moves, stages, clearing, clearance)
-        least, longer = np.array(self.least), np.array([self.staying])
-        return Rules(place, first, first, follows, moves, who, clearing, clearance, least, longer)
+        return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least))
 
     def decide(
         self,
@@ -102,6 +109,7 @@ class Crossing:
             np.zeros(stages) + np.array(stand, dtype=float),
             np.zeros((stages, self.bins)) if come is None else come,
             np.zeros(stages) + np.array(worth, dtype=float),
+            self.ends(worth),
             np.zeros(stages) + np.array(most, dtype=float),
             plan[None].copy(),
             sent,
@@ -152,7 +160,7 @@ def waited(shown: list[int], drawn: Drawn) -> float:
         for stage, arriving in zip(shown, come[stream], strict=True):
             queue = max(queue + arriving - (most if stage == stream else 0.0), 0.0)
             total += worth[stream] * queue
-        total += crossing.staying * worth[stream] * queue
+        total += crossing.ends(worth)[stream] * queue
     return total
 
 
@@ -160,8 +168,8 @@ def a_bin(green: Floats, place: int, queue: Floats, drawn: Drawn) -> tuple[float
     """What is waited in a bin of which streams have the share `green`; the queues."""
     crossing, _, come, worth, most = drawn
     queue = np.maximum(queue + np.array(come)[:, place] - green * most, 0.0)
-    bins = 1 + crossing.staying * (place == len(come[0]) - 1)
-    return bins * float(np.array(worth) @ queue), queue
+    weights = np.array(worth) + crossing.ends(worth) * (place == len(come[0]) - 1)
+    return float(weights @ queue), queue
 
 
 def plainly(drawn: Drawn, rest: int) -> tuple[set[int], float]:
@@ -205,7 +213,8 @@ def junctions(draw: st.DrawFn, stages: int = 2) -> Drawn:
     """So many stages, who stands and comes, how much each is worth, and what leaves in a bin."""
     few = lists(st.integers(1, 2), stages).map(tuple)
     longer = draw(st.sampled_from([0.0, 5.0, 20.0]))
-    crossing = Crossing(draw(few), draw(few), draw(st.integers(8, 10)), staying=longer)
+    needed = tuple(draw(lists(st.sampled_from([0.0, 3.0, 12.0]), stages)))
+    crossing = Crossing(draw(few), draw(few), draw(st.integers(8, 10)), staying=longer, needing=needed)
     veh = st.integers(0, 24).map(lambda quarters: quarters / 4)
     share = st.sampled_from([0.0, 0.0, 0.0, 0.25, 0.5, 1.0, 2.0])
     come = draw(lists(lists(share, crossing.bins), stages))
@@ -237,7 +246,7 @@ class TestProgramme:
         best = min(cost for cost, _ in every)
         begun_so = min(cost for cost, shown in every if (shown[0] == 0) == (wish == 0))
         left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
-        planned = float(np.array(worth) @ (left_veh.sum(axis=1) + crossing.staying * left_veh[:, -1]))
+        planned = float(np.array(worth) @ left_veh.sum(axis=1) + crossing.ends(worth) @ left_veh[:, -1])
         assert best - 1e-6 <= planned <= NEAR_ENOUGH * best + 1e-6
         assert begun_so <= NEAR_ENOUGH * best + 1e-6
 
@@ -281,7 +290,7 @@ class TestProgramme:
         wish, sent = crossing.decide(stand, np.array(come), rest=rest, worth=worth, most=most)
         found, cost = plainly(drawn, rest)
         left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
-        planned = float(np.array(worth) @ (left_veh.sum(axis=1) + crossing.staying * left_veh[:, -1]))
+        planned = float(np.array(worth) @ left_veh.sum(axis=1) + crossing.ends(worth) @ left_veh[:, -1])
         assert wish in found
         assert planned == pytest.approx(cost, abs=1e-6)
 
@@ -443,17 +452,54 @@ class TestStreams:
         self.agree(network, network.fraction)
 
 
-class TestMoves:
+class TestEnding:
     def test_who_is_left_waits_longer_where_a_cycle_has_longer_clearances(self) -> None:
         first = np.array([0, 2, 4, 7])
         # Bins from each stage to its junction's nth: of the third junction those beside the cycle do not count.
         quick = [[1, 2, 1], [2, 1, 1]]
         slow = [[1, 4, 1], [4, 1, 1]]
         three = [[1, 4, 9], [9, 1, 4], [4, 9, 1]]
-        found = staying(first, np.array([*quick, *slow, *three]))
+        found = staying(lost(first, np.array([*quick, *slow, *three])))
         assert found[0] < found[1] < found[2]
         assert found[2] - found[1] == pytest.approx((12 - 8) * (found[1] - found[0]) / (8 - 4), rel=0.5)
 
+    def test_whoever_needs_a_stage_for_himself_has_others_wait_for_him(self) -> None:
+        # A main road of two streams beside a left turn, and a side road.
+        serves = np.array([[True, True, False, False], [False, False, True, False], [False, False, False, True]])
+        come, most = np.array([1.0, 0.5, 0.2, 0.3]), np.array([4.0, 4.0, 1.0, 2.0])
+        # The main road's need least: half a vehicle comes elsewhere, and four of them go in the time of a bin.
+        assert needing(serves, come, most) == pytest.approx([0, 0, 1.8 / 1 - 0.5 / 4, 1.7 / 2 - 0.5 / 4])
+
+    def test_in_which_of_two_stages_they_go_is_up_to_the_better_one(self) -> None:
+        serves = np.array([[True, True, False], [False, True, True]])
+        found = needing(serves, np.array([1.0, 0.1, 0.4]), np.ones(3))
+        assert found == pytest.approx([0, 0, 1.0 - 0.4])
+
+    def test_nobody_needs_more_where_all_are_alike_or_nobody_comes(self) -> None:
+        assert not needing(np.eye(3, dtype=bool), np.full(3, 0.7), np.full(3, 2.0)).any()
+        assert not needing(np.eye(3, dtype=bool), np.zeros(3), np.array([1.0, 2.0, 4.0])).any()
+
+    def test_who_is_never_served_needs_nothing(self) -> None:
+        serves = np.array([[True, False, False], [False, False, True]])
+        assert needing(serves, np.array([1.0, 5.0, 0.5]), np.ones(3)) == pytest.approx([0, 0, 0.5])
+        assert not needing(np.zeros((2, 0), dtype=bool), np.zeros(0), np.zeros(0)).size
+
+    def test_the_more_the_clearances_take_the_more_it_weighs(self, utn17: Network) -> None:
+        streams = Streams(utn17)
+        clearance = Moves(utn17, streams, 2).bins
+        come = np.linspace(0.1, 0.4, len(streams.link))
+        needed = []
+        for times in (0, 1, 2):
+            ending = Ending(streams, times * clearance)
+            assert not ending.weights(np.zeros(len(come))).any()
+            ending.take_up(come, np.ones(len(come)))
+            needed.append(ending.weights(np.zeros(len(come))))
+        assert not needed[0].any()
+        assert needed[1].any()
+        assert (needed[2][needed[1] > 0] > needed[1][needed[1] > 0]).all()
+
+
+class TestMoves:
     def test_they_are_the_stages_greens_first(self, net: Network) -> None:
         streams = Streams(net)
         moves = Moves(net, streams, 2)

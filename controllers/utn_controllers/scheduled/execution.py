@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from utn_controllers.scheduled.moves import Moves, Rules, staying
+from utn_controllers.scheduled.ending import Ending
+from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.standstill import Standstill
@@ -81,8 +82,8 @@ class Scheduled:
             moves.row,
             moves.bins,
             np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
-            staying(self._streams.first_stage, moves.bins),
         )
+        self._ending = Ending(self._streams, moves.bins)
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules."""
         self._row = np.argsort(stages)
@@ -96,6 +97,7 @@ class Scheduled:
         """Take up the turning fractions as they are at present, and the plan's greens as bounds if they are to be."""
         self._outlook.take_up(state.fraction)
         self._take_up()
+        self._ending.take_up(self._outlook.come_veh, self._flow)
         if self.settings.bounds == "plan":
             self._green_s = plan.green_s
 
@@ -122,6 +124,7 @@ class Scheduled:
                 stand,
                 come,
                 worth,
+                self._ending.weights(worth),
                 most,
                 self._plan,
                 outlook.sent_veh,
@@ -138,7 +141,8 @@ class Scheduled:
 
     def _take_up(self) -> None:
         flow_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]
-        self._most = self.settings.discharge * flow_veh_s * self._outlook.of_group * BIN_S
+        self._flow = self.settings.discharge * flow_veh_s * BIN_S
+        self._most = self._flow * self._outlook.of_group
 
     def _orders(self) -> Bools:
         """(S, most stages) whether its junction's nth stage may come after each."""

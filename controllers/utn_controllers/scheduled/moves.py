@@ -15,11 +15,6 @@ from utn_sumo import clearances
 from utn_sumo.clearances import GREEN, Phases, Times
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
-LEAST_STAYING_BINS = 5.0
-"""Who is still there when a schedule ends waits so much longer, or more: else a change later would cost nothing."""
-QUICK_BINS, STAYING_OF_LOST = 2, 2.5
-"""Of what the clearances of a cycle take so little does not count, of the rest so many times: as they, cycles grow."""
-
 
 class Rules(NamedTuple):
     """What junctions (J) may show, by stages (S), and what moves then, by rows (R) of which the first are the stages'.
@@ -46,8 +41,6 @@ class Rules(NamedTuple):
     """(S, most stages of a junction) bins of that clearance: one or more."""
     least: Ints
     """(S,) bins of green, one or more."""
-    staying: Floats
-    """(J,) bins that who is still there at the end of a schedule waits longer, as from `staying`."""
 
 
 class Moves:
@@ -98,16 +91,6 @@ def going(share: Floats, stages: int, row: Ints, bins: Ints) -> Ints:
         streams = np.flatnonzero(share[first:last].any(axis=0))
         who[first, : len(streams)] = streams
     return who
-
-
-def staying(first_stage: Ints, clearance: Ints) -> Floats:
-    """(J,) bins that who is still there at the end of a schedule waits longer, by `Rules` of the junctions."""
-    sizes = np.diff(first_stage)
-    lost = [
-        sum(clearance[first + place, (place + 1) % size] for place in range(size))
-        for first, size in zip(first_stage[:-1], sizes, strict=True)
-    ]
-    return np.maximum(STAYING_OF_LOST * (np.array(lost) - QUICK_BINS), LEAST_STAYING_BINS)
 
 
 def _shares(phases: Phases, letters: list[tuple[int, ...]], bin_s: int) -> Floats:

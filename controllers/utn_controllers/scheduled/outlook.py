@@ -59,6 +59,11 @@ class Outlook:
         self._room = rooms_veh(network)
         self.take_up(network.fraction)
 
+    @property
+    def come_veh(self) -> Floats:
+        """(N,) vehicles that have come in a bin of late."""
+        return np.asarray(self._rate[0][self.streams.link] * self.of_link)
+
     def take_up(self, fraction: Floats) -> None:
         """Go by these turning fractions (M,) from now on."""
         self.of_link, self.of_group = self.streams.shares(fraction)

@@ -26,13 +26,13 @@ ALIKE = 1e-9
 
 @compiled
 def schedules(
-    stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats,
+    stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats, ends: Floats,
     most: Floats, plan: Ints, sent: Floats,
 ) -> Ints:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
     `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
-    weight of a vehicle, `most` (N,) that leave in a bin of green.
+    weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `most` (N,) that leave in a bin of green.
 
     `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
@@ -50,8 +50,8 @@ def schedules(
             present += 1
         stages = rules.first_stage[junction + 1] - low
         chosen = _schedule(
-            present, rest[junction], low, stages, rules, rules.staying[junction], stand[a:b], come[a:b], worth[a:b],
-            most[a:b], plan[junction], sent[a:b],
+            present, rest[junction], low, stages, rules, stand[a:b], come[a:b], worth[a:b], ends[a:b], most[a:b],
+            plan[junction], sent[a:b],
         )  # fmt: skip
         wish[junction] = rules.stages[low + chosen]
     return wish
@@ -59,14 +59,14 @@ def schedules(
 
 @compiled
 def _schedule(
-    present: int, rest: int, low: int, stages: int, rules: Rules, staying: float, stand: Floats, come: Floats,
-    worth: Floats, most: Floats, plan: Ints, sent: Floats,
+    present: int, rest: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats, worth: Floats,
+    ends: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on."""
     chosen = present
     called = _called(present, low, stages, rules, stand, come)
     if called.any():
-        traffic = _sums(rules.moves[low : low + stages], stand, come, worth, most, staying)
+        traffic = _sums(rules.moves[low : low + stages], stand, come, worth, ends, most)
         # What was best a bin ago is seldom far from what is best now.
         known = _waited(plan, rules.moves, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
@@ -103,7 +103,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
 ) -> int:
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
-    staying = traffic.staying
+    ends = traffic.ends
     moves, going, clearing, clearance = rules.moves, rules.going, rules.clearing, rules.clearance
     came, least = traffic.came, rules.least
     (streams, bins), stages = come.shape, len(called)
@@ -155,12 +155,14 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                         opens = min(now + clearance[row, other], bins)
                         if spent >= cost[opens, other] - ALIKE:
                             continue
-                        until = spent + _held(stages, grown, paid, staying, now, opens, held + moving)
+                        until = spent + _held(stages, grown, paid, now, opens, held + moving)
+                        if opens == bins:
+                            until += _left(row, begin, now, veh, moves, came, ends)
                         if clearing[row, other] >= 0:
                             if clearing[row, other] != won_in:
                                 won_in = clearing[row, other]
                                 won = _won(
-                                    won_in, begin, row, now, opens, veh, moves, going, come, came, worth, most, staying
+                                    won_in, begin, row, now, opens, veh, moves, going, come, came, worth, ends, most
                                 )  # fmt: skip
                             until -= won
                         if until < cost[opens, other] - ALIKE:
@@ -170,7 +172,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                             whence[opens, other, 2] = now
                     if now >= must_end:
                         break
-                spent += _held(stage, grown, paid, staying, now, now + 1, held)
+                spent += _held(stage, grown, paid, now, now + 1, held)
                 held += grown[stage, now + 1] - grown[stage, now]
                 moving = 0.0
                 for place in range(greens):
@@ -179,7 +181,9 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
                     moving += worth[stream] * veh[stream]
                 now += 1
-                spent += moving * (1 + staying * (now == bins))
+                spent += moving
+            if now == bins:
+                spent += _left(row, begin, now, veh, moves, came, ends)
             if now == bins and spent < best - ALIKE:
                 best, last_begin, last_stage = spent, begin, stage
     for stage in range(stages):
@@ -191,7 +195,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
 
 @compiled
 def _sums(
-    serves: Floats, stand: Floats, come: Floats, worth: Floats, most: Floats, staying: float
+    serves: Floats, stand: Floats, come: Floats, worth: Floats, ends: Floats, most: Floats
 ) -> Traffic:  # fmt: skip
     """The traffic with what the costs of red are made of."""
     stages, (streams, bins) = len(serves), come.shape
@@ -207,23 +211,34 @@ def _sums(
     for stage in range(stages + 1):
         for place in range(bins):
             paid[stage, place + 1] = paid[stage, place] + grown[stage, place + 1]
-        paid[stage, bins] += staying * grown[stage, bins]
-    return Traffic(stand, come, came, grown, paid, worth, most, staying)
+    return Traffic(stand, come, came, grown, paid, worth, ends, most)
 
 
 @compiled
-def _held(
-    stage: int, grown: Floats, paid: Floats, staying: float, since: int, until: int, weight: float
-) -> float:  # fmt: skip
+def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weight: float) -> float:
     """What those wait in some bins who have red in a stage, and of whom so much stood before."""
-    over = until - since + staying * (until > since and until == grown.shape[1] - 1)
-    return float(paid[stage, until] - paid[stage, since] + over * (weight - grown[stage, since]))
+    return float(paid[stage, until] - paid[stage, since] + (until - since) * (weight - grown[stage, since]))
+
+
+@compiled
+def _left(
+    row: int, begin: int, now: int, veh: Floats, moves: Floats, came: Floats, ends: Floats
+) -> float:  # fmt: skip
+    """What those weigh who are left at the end if nobody goes from `now` on; `veh` of who had red, as at its `begin`.
+
+    Of who has green in the stage, it is as it is now.
+    """
+    total = 0.0
+    for stream in range(len(veh)):
+        since = begin if moves[row, stream] == 0 else now
+        total += ends[stream] * (veh[stream] + came[stream, came.shape[1] - 1] - came[stream, since])
+    return total
 
 
 @compiled
 def _won(
     clearing: int, begin: int, row: int, end: int, until: int, veh: Floats, moves: Floats, going: Ints, come: Floats,
-    came: Floats, worth: Floats, most: Floats, staying: float,
+    came: Floats, worth: Floats, ends: Floats, most: Floats,
 ) -> float:  # fmt: skip
     """What is waited less in a clearance than if all had red; `veh` of who had red already as the stage began."""
     won, place = 0.0, 0
@@ -236,8 +251,10 @@ def _won(
         for now in range(end, until):
             red += come[stream, now]
             queue = max(queue + come[stream, now] - moves[clearing + now - end, stream] * most[stream], 0.0)
-            less += (red - queue) * (1 + staying * (now == come.shape[1] - 1))
+            less += red - queue
         won += worth[stream] * less
+        if until == come.shape[1]:
+            won += ends[stream] * (red - queue)
         place += 1
     return won
 
@@ -280,8 +297,7 @@ def _waited(plan: Ints, moves: Floats, traffic: Traffic) -> float:
             if share > 0:
                 veh = max(veh - share * traffic.most[stream], 0.0)
             waited += veh
-        waited += traffic.staying * veh
-        total += traffic.worth[stream] * waited
+        total += traffic.worth[stream] * waited + traffic.ends[stream] * veh
     return total
 
 

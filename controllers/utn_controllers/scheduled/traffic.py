@@ -19,10 +19,10 @@ class Traffic(NamedTuple):
     grown: Floats
     """(s + 1, K + 1) sum of what those weigh who have come and have red in a stage; in the last row, of all."""
     paid: Floats
-    """(s + 1, K + 1) sum of what they have waited, if nobody had stood before; in the last column, and will."""
+    """(s + 1, K + 1) sum of what they have waited, if nobody had stood before."""
     worth: Floats
-    """(n,) weight of a vehicle."""
+    """(n,) weight of a vehicle in a bin."""
+    ends: Floats
+    """(n,) weight of a vehicle that is left at the end."""
     most: Floats
     """(n,) vehicles that leave in a bin of green."""
-    staying: float
-    """Bins that who is still there at the end waits longer."""

@@ -1,0 +1,72 @@
+"""What it costs to leave somebody there at the end of a schedule: else a change of stages late in it would not pay.
+
+Who is left waits until the schedules after this one, the longer the more time a cycle loses to clearances. And others
+wait for him: letting him go takes time of a stage, in which nobody else's vehicles leave. Where one stream has a lane
+and the others many, that is the greater part of it, and a schedule that did not count it would skip the one stage in
+every other cycle, and have its queue wait twice as long for a second or two of all others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from utn_controllers.scheduled.streams import Streams
+from utn_sumo.contract import Bools, Floats, Ints
+
+LEAST_STAYING_BINS = 5.0
+"""Who is still there when a schedule ends waits so much longer, or more."""
+QUICK_BINS, STAYING_OF_LOST = 2, 2.5
+"""Of what the clearances of a cycle take so little does not count, of the rest so many times: as they, cycles grow."""
+NEEDING_OF_STAYING = 1.4
+"""So many times as long as he waits longer than that have others to wait who come while he is let go."""
+
+
+class Ending:
+    """Keeps what a vehicle of each stream weighs that is left at a schedule's end."""
+
+    def __init__(self, streams: Streams, clearance: Ints):
+        """`clearance` (S, most stages of a junction) in bins, as in `Rules`."""
+        self._streams = streams
+        staying_bins = staying(lost(streams.first_stage, clearance))
+        self._staying = np.repeat(staying_bins, np.diff(streams.first))
+        self._weight = NEEDING_OF_STAYING * (staying_bins - LEAST_STAYING_BINS)
+        self._needing = np.zeros(len(streams.link))
+
+    def take_up(self, come_veh: Floats, most_veh: Floats) -> None:
+        """Go by these vehicles that come of late, and that a stream alone lets go, in a bin (N,) from now on."""
+        streams = self._streams
+        for junction, weight in enumerate(self._weight):
+            own = slice(*streams.first[junction : junction + 2])
+            serves = streams.serves[slice(*streams.first_stage[junction : junction + 2]), own]
+            self._needing[own] = weight * needing(serves, come_veh[own], most_veh[own])
+
+    def weights(self, worth: Floats) -> Floats:
+        """(N,) what a vehicle weighs that is left, by what it is worth in a bin."""
+        return np.asarray(worth * self._staying + self._needing)
+
+
+def lost(first_stage: Ints, clearance: Ints) -> Ints:
+    """(J,) bins that the clearances of a cycle take, by `Rules` of the junctions."""
+    sizes = np.diff(first_stage)
+    found = [
+        sum(clearance[first + place, (place + 1) % size] for place in range(size))
+        for first, size in zip(first_stage[:-1], sizes, strict=True)
+    ]
+    return np.array(found, dtype=np.int64)
+
+
+def staying(lost_bins: Ints) -> Floats:
+    """(J,) bins that who is left waits longer, by what clearances take."""
+    return np.asarray(np.maximum(STAYING_OF_LOST * (lost_bins - QUICK_BINS), LEAST_STAYING_BINS))
+
+
+def needing(serves: Bools, come: Floats, most: Floats) -> Floats:
+    """(n,) others that come while one vehicle of each stream of a junction is let go, in its best stage.
+
+    Less what it is for the stream with fewest: what all need alike makes no difference to who goes first, and counted
+    in full it would draw out all greens. `serves` (s, n), vehicles that `come` (n,) and leave at `most` (n,) in a bin.
+    """
+    others = (~serves * come).sum(axis=1)
+    fewest = np.where(serves, others[:, None], np.inf).min(axis=0, initial=np.inf) / most
+    served = np.isfinite(fewest)
+    return np.where(served, fewest - fewest.min(initial=np.inf), 0.0)
