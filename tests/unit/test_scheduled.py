@@ -31,7 +31,7 @@ Shares = Sequence[Sequence[float]]
 
 BLOCKED_VEH = 1e-6
 NEAR_ENOUGH = 1.1
-"""Of the best there is: of two ways to a state the schedule keeps the better one, whatever queues it leaves."""
+"""Of the best there is: of two ways to a state the schedule keeps the one that seems better, with its queues."""
 
 
 @dataclass
@@ -178,10 +178,10 @@ def plainly(drawn: Drawn, rest: int) -> tuple[set[int], float]:
     bins, stages, ends = crossing.bins, len(stand), list[tuple[float, int]]()
     green, comes = crossing.green(), stand + np.sum(drawn[2], axis=1) > 0
     called = [stage for stage in range(stages) if stage == 0 or (comes & (green[stage] > green[0])).any()]
-    # (begin, stage): cost, queues, the stage led to in the first bin.
-    states = {(0, 0): (0.0, stand, 0)}
+    # (begin, stage): cost, queues, the stage led to in the first bin, cost if it stayed until the end.
+    states = {(0, 0): (0.0, stand, 0, 0.0)}
     for begin, stage in np.ndindex(bins, stages):
-        spent, queue, first = states.get((begin, stage), (np.inf, stand, 0))
+        spent, queue, first, _ = states.get((begin, stage), (np.inf, stand, 0, 0.0))
         last = bins if begin else min(rest, bins)
         for now in range(begin, last + 1):
             if now == bins:
@@ -194,12 +194,14 @@ def plainly(drawn: Drawn, rest: int) -> tuple[set[int], float]:
                     for still in crossing.cleared(stage, other)[: bins - now]:
                         cost, cleared = a_bin(still, opens, cleared, drawn)
                         until, opens = until + cost, opens + 1
-                    if until < states.get((opens, other), (np.inf,))[0] - 1e-9:
-                        states[opens, other] = until, cleared, other if now == 0 else first
+                    weights = (bins - opens) * np.array(drawn[3]) + crossing.ends(drawn[3]) * (opens < bins)
+                    stayed = until + float((weights * (green[other] == 0)) @ cleared)
+                    if stayed < states.get((opens, other), (np.inf,))[-1] - 1e-9:
+                        states[opens, other] = until, cleared, other if now == 0 else first, stayed
             if now < last:
                 cost, queue = a_bin(green[stage], now, queue, drawn)
                 spent += cost
-    ends += [(cost, first) for (begin, _), (cost, _, first) in states.items() if begin == bins]
+    ends += [(cost, first) for (begin, _), (cost, _, first, _) in states.items() if begin == bins]
     least = min(ends, key=lambda end: end[0])[0]
     return {first for cost, first in ends if cost <= least + 1e-9}, least
 

@@ -1,10 +1,11 @@
 """The dynamic programme of a junction: which stages to show in the bins ahead, so that least is waited.
 
 Forward over the bins, as COP (Sen and Head 1997). A state is a stage that begins in a bin; of two ways that lead to
-it, the one on which less has been waited goes on, with the queues that it leaves. From there the stage may last until
-any later bin. Of those who have red nobody leaves, so that what they wait is a difference of sums made once; bin by
-bin go only those who have green, in a stage or for a while in a clearance. A way is left on which more has been waited
-than on another to its end, at first than by the schedule of the bin before.
+it, one goes on, with the queues that it leaves: that on which less would have been waited at the end, if the stage
+stayed until then. What has been waited so far would be in favour of ways that have left somebody out. From there the
+stage may last until any later bin. Of those who have red nobody leaves, so that what they wait is a difference of sums
+made once; bin by bin go only those who have green, in a stage or for a while in a clearance. A way is left on which
+more has been waited than on another to its end, at first than by the schedule of the bin before.
 """
 
 from __future__ import annotations
@@ -107,8 +108,8 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     moves, going, clearing, clearance = rules.moves, rules.going, rules.clearing, rules.clearance
     came, least = traffic.came, rules.least
     (streams, bins), stages = come.shape, len(called)
-    # The state: the stage that begins and when; for each the least cost until then, the queues, and whence.
-    cost = np.full((bins + 1, stages), NEVER)
+    # The state: the stage that begins and when; for each the cost until then, by what it won, the queues, and whence.
+    cost, rank = np.full((bins + 1, stages), NEVER), np.full((bins + 1, stages), NEVER)
     queue = np.empty((bins, stages, streams))
     # Whence: when the stage before began, which it was, when it ended.
     whence = np.zeros((bins + 1, stages, 3), np.int64)
@@ -153,7 +154,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     for place in range(nexts):
                         other = others[place]
                         opens = min(now + clearance[row, other], bins)
-                        if spent >= cost[opens, other] - ALIKE:
+                        if spent >= rank[opens, other] - ALIKE:
                             continue
                         until = spent + _held(stages, grown, paid, now, opens, held + moving)
                         if opens == bins:
@@ -165,8 +166,16 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                                     won_in, begin, row, now, opens, veh, moves, going, come, came, worth, ends, most
                                 )  # fmt: skip
                             until -= won
-                        if until < cost[opens, other] - ALIKE:
-                            cost[opens, other] = until
+                        if until >= rank[opens, other] - ALIKE:
+                            continue
+                        behind = 0.0
+                        if opens < bins:
+                            behind = _behind(
+                                low + other, row, clearing[row, other], begin, now, opens, veh, moves, come, came,
+                                worth, ends, most,
+                            )  # fmt: skip
+                        if until + behind < rank[opens, other] - ALIKE:
+                            cost[opens, other], rank[opens, other] = until, until + behind
                             whence[opens, other, 0] = begin
                             whence[opens, other, 1] = stage
                             whence[opens, other, 2] = now
@@ -232,6 +241,28 @@ def _left(
     for stream in range(len(veh)):
         since = begin if moves[row, stream] == 0 else now
         total += ends[stream] * (veh[stream] + came[stream, came.shape[1] - 1] - came[stream, since])
+    return total
+
+
+@compiled
+def _behind(
+    other: int, row: int, clearing: int, begin: int, now: int, opens: int, veh: Floats, moves: Floats, come: Floats,
+    came: Floats, worth: Floats, ends: Floats, most: Floats,
+) -> float:  # fmt: skip
+    """What those cost until the end who are there when a stage opens that does not serve them; `veh` as in `_left`.
+
+    By rows of the `other` stage, of that which ends `now`, and of the clearance between them, -1 if all is red in it.
+    """
+    total, rest = 0.0, come.shape[1] - opens
+    for stream in range(len(veh)):
+        if moves[other, stream] == 0:
+            queue = veh[stream]
+            if moves[row, stream] == 0:
+                queue += came[stream, now] - came[stream, begin]
+            for place in range(now, opens):
+                leaves = moves[clearing + place - now, stream] * most[stream] if clearing >= 0 else 0.0
+                queue = max(queue + come[stream, place] - leaves, 0.0)
+            total += (rest * worth[stream] + ends[stream]) * queue
     return total
 
 
