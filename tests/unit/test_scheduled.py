@@ -116,8 +116,9 @@ class Crossing:
         )
         return int(wish[0]), sent
 
-    def begins(self, stand: object, come: Floats, most: float = 1.0) -> list[tuple[int, int, Floats]]:
+    def begins(self, stand: object, come: Floats, most: object = 1.0) -> list[tuple[int, int, Floats]]:
         """(bin, stage, queues) of every end of a green, with a new schedule in every bin of `come` (N, K or more)."""
+        leaves = np.zeros(len(self.clearance)) + np.array(most, dtype=float)
         queue = np.zeros(len(self.clearance)) + np.array(stand, dtype=float)
         stage, green_from, ended = 0, 0, []
         for now in range(come.shape[1] - self.bins):
@@ -129,7 +130,7 @@ class Crossing:
                     stage = wish
             queue += come[:, now]
             if now >= green_from:
-                queue[stage] = max(queue[stage] - most, 0.0)
+                queue[stage] = max(queue[stage] - leaves[stage], 0.0)
         return ended
 
 
@@ -295,6 +296,18 @@ class TestProgramme:
         planned = float(np.array(worth) @ left_veh.sum(axis=1) + crossing.ends(worth) @ left_veh[:, -1])
         assert wish in found
         assert planned == pytest.approx(cost, abs=1e-6)
+
+    @pytest.mark.parametrize("come", [(1.4, 0.14, 0.14), (0.9, 0.25, 0.15), (1.0, 0.2, 0.2)])
+    @pytest.mark.parametrize("clearance", [3, 4])
+    def test_no_stage_is_left_out_again_and_again_beside_a_main_road(
+        self, come: tuple[float, float, float], clearance: int
+    ) -> None:
+        crossing = Crossing((clearance,) * 3, (2,) * 3, staying=5.0 * clearance)
+        arriving = np.tile(np.array(come)[:, None], 300 + crossing.bins)
+        ended = crossing.begins([0.0, 0.0, 0.0], arriving, most=(4.0, 1.0, 1.0))
+        shown = [stage for _, stage, _ in ended]
+        assert len(shown) > 20
+        assert all(set(shown[place : place + 6]) == {0, 1, 2} for place in range(len(shown) - 6))
 
     def test_with_nobody_anywhere_the_present_stage_stays(self) -> None:
         for stage in range(3):
