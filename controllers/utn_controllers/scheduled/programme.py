@@ -259,9 +259,12 @@ def _behind(
             queue = veh[stream]
             if moves[row, stream] == 0:
                 queue += came[stream, now] - came[stream, begin]
-            for place in range(now, opens):
-                leaves = moves[clearing + place - now, stream] * most[stream] if clearing >= 0 else 0.0
-                queue = max(queue + come[stream, place] - leaves, 0.0)
+            if clearing < 0:
+                queue += came[stream, opens] - came[stream, now]
+            else:
+                for place in range(now, opens):
+                    leaves = moves[clearing + place - now, stream] * most[stream]
+                    queue = max(queue + come[stream, place] - leaves, 0.0)
             total += (rest * worth[stream] + ends[stream]) * queue
     return total
 
