@@ -497,6 +497,7 @@ class TestEnding:
     def test_who_is_never_served_needs_nothing(self) -> None:
         serves = np.array([[True, False, False], [False, False, True]])
         assert needing(serves, np.array([1.0, 5.0, 0.5]), np.ones(3)) == pytest.approx([0, 0, 0.5])
+        assert not needing(np.zeros((2, 3), dtype=bool), np.ones(3), np.ones(3)).any()
         assert not needing(np.zeros((2, 0), dtype=bool), np.zeros(0), np.zeros(0)).size
 
     def test_the_more_the_clearances_take_the_more_it_weighs(self, utn17: Network) -> None:

@@ -66,7 +66,8 @@ def needing(serves: Bools, come: Floats, most: Floats) -> Floats:
     Less what it is for the stream with fewest: what all need alike makes no difference to who goes first, and counted
     in full it would draw out all greens. `serves` (s, n), vehicles that `come` (n,) and leave at `most` (n,) in a bin.
     """
-    others = (~serves * come).sum(axis=1)
-    fewest = np.where(serves, others[:, None], np.inf).min(axis=0, initial=np.inf) / most
-    served = np.isfinite(fewest)
-    return np.where(served, fewest - fewest.min(initial=np.inf), 0.0)
+    others, served = (~serves * come).sum(axis=1), serves.any(axis=0)
+    found = np.zeros(len(come))
+    found[served] = np.where(serves, others[:, None], np.inf)[:, served].min(axis=0) / most[served]
+    found[served] -= found[served].min(initial=np.inf)
+    return found
