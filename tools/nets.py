@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from utn_sumo import network, sumo_tools
-from utn_sumo.contract import EXIT, Junction, LaneGroup, Link, Network, Stage, Turn
+from utn_sumo.contract import EXIT, Junction, LaneGroup, LaneSet, Link, Network, Stage, Turn
 
 CYCLE_S, MIN_GREEN_S, YELLOW_S, ALL_RED_S = 120.0, 10.0, 3.0, 2.0
 FREE_SPEED_M_S, SPACING_M, LANE_VEH_S = 40 / 3.6, 7.5, 0.5
@@ -56,6 +56,7 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
 
     turns: list[Turn] = []
     groups = [LaneGroup(index, tuple(range(link.lanes))) for index, link in enumerate(links)]
+    lane_sets: list[LaneSet] = []
     stages: list[Stage] = []
     junctions: list[Junction] = []
     for row in range(rows):
@@ -67,11 +68,13 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
             for position, link in enumerate(here):
                 ahead = float(rng.uniform(0.55, 0.85))
                 share_along = 1 - ahead if links[link].id.startswith("v") else ahead
-                served = []
+                served: list[int] = []
                 for next_link, share in ((along, share_along), (across, 1 - share_along)):
                     served.append(len(turns))
                     to_edge = links[next_link].id if next_link != EXIT else f"exit{row}.{column}"
                     turns.append(Turn(link, to_edge, next_link, share, (), link))
+                own = tuple((2 * position + place,) for place in range(2))
+                lane_sets.append(LaneSet(link, groups[link].lanes, tuple(served), own))
                 letters = "".join("G" if other == position else "r" for other in range(len(here)) for _ in range(2))
                 clearance = ((letters.replace("G", "y"), YELLOW_S), ("r" * len(letters), ALL_RED_S))
                 stages.append(
@@ -94,6 +97,7 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
         links=tuple(links),
         turns=tuple(turns),
         groups=tuple(groups),
+        lane_sets=tuple(lane_sets),
         stages=tuple(stages),
         junctions=tuple(junctions),
         edge_lanes={link.id: tuple(range(link.lanes)) for link in links},

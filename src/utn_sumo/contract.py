@@ -3,7 +3,8 @@
     plant -> Measurement -> State -> Forecast -> Plan -> (checked) -> plant
 
 Counts are in veh, times in s, lengths in m, rates in veh/s unless a name says otherwise. Index
-spaces: Z links, M turns (one per link and next link or exit), S stages, J junctions, Kp and Kc horizons.
+spaces: Z links, M turns (one per link and next link or exit), G lane groups, L lane sets, S stages, J junctions, Kp and
+Kc horizons.
 """
 
 from __future__ import annotations
@@ -69,6 +70,18 @@ class LaneGroup:
     link: int
     lanes: tuple[int, ...]
     """Numbers of the lanes of the link's last edge."""
+
+
+@dataclass(frozen=True)
+class LaneSet:
+    """Lanes of a lane group from which the same turns go by the same signals: who stands there moves alike."""
+
+    group: int
+    lanes: tuple[int, ...]
+    """Numbers of the lanes of the link's last edge."""
+    turns: tuple[int, ...]
+    letters: tuple[tuple[int, ...], ...]
+    """The letters of its junction by which each turn goes from these lanes: none where no signal stops it."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +166,8 @@ class Network:
     turns: tuple[Turn, ...]
     groups: tuple[LaneGroup, ...]
     """In the order of their links."""
+    lane_sets: tuple[LaneSet, ...]
+    """In the order of their lane groups."""
     stages: tuple[Stage, ...]
     junctions: tuple[Junction, ...]
     edge_lanes: Mapping[str, tuple[int, ...]]
@@ -197,6 +212,16 @@ class Network:
     def group_link(self) -> Ints:
         """(G,) link of each lane group."""
         return np.array([group.link for group in self.groups], dtype=np.int64)
+
+    @cached_property
+    def set_group(self) -> Ints:
+        """(L,) lane group of each lane set."""
+        return np.array([lane_set.group for lane_set in self.lane_sets], dtype=np.int64)
+
+    @cached_property
+    def set_link(self) -> Ints:
+        """(L,) link of each lane set."""
+        return np.asarray(self.group_link[self.set_group])
 
     @cached_property
     def unsignalled(self) -> Bools:
@@ -265,10 +290,15 @@ class Network:
         return np.array([link.saturation_flow_veh_s for link in self.links])
 
     @cached_property
+    def set_saturation_flow_veh_s(self) -> Floats:
+        """(L,) saturation flow of each lane set: its share of the link's lanes."""
+        lanes = np.array([len(lane_set.lanes) for lane_set in self.lane_sets])
+        return np.asarray(self.saturation_flow_veh_s[self.set_link] * lanes / self._lanes[self.set_link])
+
+    @cached_property
     def group_saturation_flow_veh_s(self) -> Floats:
-        """(G,) saturation flow of each lane group: its share of the link's lanes."""
-        lanes = np.array([len(group.lanes) for group in self.groups])
-        return np.asarray(self.saturation_flow_veh_s[self.group_link] * lanes / self._lanes[self.group_link])
+        """(G,) saturation flow of each lane group."""
+        return np.bincount(self.set_group, self.set_saturation_flow_veh_s, len(self.groups)).astype(float)
 
     @cached_property
     def _lanes(self) -> Ints:
@@ -329,14 +359,15 @@ class Network:
 
     @cached_property
     def watched_lane_m(self) -> tuple[Floats, Floats]:
-        """Lane metres that the lane-area detectors see: (G,) by lane group, (Z,) of each link before its lanes part."""
+        """Lane metres that the lane-area detectors see: (L,) by lane set, (Z,) of each link before its lanes part."""
         seen_m = [dict(self.watched(link)) for link in self.links]
-        groups = [len(group.lanes) * seen_m[group.link][self.links[group.link].edges[-1]] for group in self.groups]
+        last_m = [seen[link.edges[-1]] for seen, link in zip(seen_m, self.links, strict=True)]
+        sets = [len(lane_set.lanes) * last_m[self.groups[lane_set.group].link] for lane_set in self.lane_sets]
         before = [
             sum(metres * len(self.edge_lanes[edge]) for edge, metres in seen.items() if edge != link.edges[-1])
             for seen, link in zip(seen_m, self.links, strict=True)
         ]
-        return np.array(groups), np.array(before, dtype=float)
+        return np.array(sets), np.array(before, dtype=float)
 
     @cached_property
     def clearance_s(self) -> Floats:
@@ -429,6 +460,7 @@ class Network:
         links = np.concatenate([self.links_of[junction] for junction in junctions]).tolist()
         groups = np.concatenate([self.groups_of[junction] for junction in junctions]).tolist()
         turns = np.concatenate([self.turns_of[junction] for junction in junctions]).tolist()
+        lane_sets = [lane_set for group in groups for lane_set in self.lane_sets if lane_set.group == group]
         stages = [stage for junction in junctions for stage in self.junctions[junction].stages]
         link_place, turn_place, group_place, stage_place, junction_place = (
             {whole: position for position, whole in enumerate(each)}
@@ -451,6 +483,14 @@ class Network:
             ),
             groups=tuple(
                 replace(group, link=link_place[group.link]) for group in (self.groups[index] for index in groups)
+            ),
+            lane_sets=tuple(
+                replace(
+                    lane_set,
+                    group=group_place[lane_set.group],
+                    turns=tuple(turn_place[turn] for turn in lane_set.turns),
+                )
+                for lane_set in lane_sets
             ),
             stages=tuple(
                 replace(
@@ -642,13 +682,13 @@ class View(Protocol):
 
     @property
     def left_veh(self) -> Floats:
-        """(G,) vehicles that have left over the stop line of each lane group since the run began."""
+        """(L,) vehicles that have left over the stop line of each lane set since the run began."""
         ...
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
         """Vehicles before some junctions (J,) by how far they are from the stop line (`ZONES_M`), none elsewhere.
 
-        (G, zones) on the lanes of each lane group, (Z, zones) on each link before its lanes part.
+        (L, zones) on the lanes of each lane set, (Z, zones) on each link before its lanes part.
         """
         ...
 

@@ -22,7 +22,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from utn_sumo.clearances import GIVES_WAY
-from utn_sumo.contract import ZONES_M, Floats, LaneGroup, Link, Measurement, Network
+from utn_sumo.contract import ZONES_M, Floats, LaneSet, Link, Measurement, Network
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -52,12 +52,14 @@ class DetectorIds:
     """(G,) of the lane-area detectors those on a lane group."""
     group_stop_line: tuple[tuple[str, ...], ...]
     """(G,) of the loops at the stop line those on a lane group."""
+    set_stop_line: tuple[tuple[str, ...], ...]
+    """(L,) of the loops at the stop line those on a lane set."""
     upstream: tuple[tuple[str, ...], ...]
     """(Z,) of the lane-area detectors those before the lane groups part."""
     joining: tuple[tuple[str, ...], ...]
     parting: tuple[tuple[str, ...], ...]
-    group_zone: tuple[tuple[tuple[str, ...], ...], ...]
-    """(G, zones) of the detectors of zones those on a lane group."""
+    set_zone: tuple[tuple[tuple[str, ...], ...], ...]
+    """(L, zones) of the detectors of zones those on a lane set."""
     upstream_zone: tuple[tuple[tuple[str, ...], ...], ...]
     """(Z, zones) those before the lane groups part."""
     amid: tuple[tuple[str, ...], ...]
@@ -70,8 +72,11 @@ def ids(network: Network) -> DetectorIds:
     def on(kind: str, edge: str) -> tuple[str, ...]:
         return tuple(_named(kind, f"{edge}_{lane}") for lane in network.edge_lanes[edge])
 
-    def of_group(kind: str, group: LaneGroup) -> tuple[str, ...]:
-        return tuple(_named(kind, f"{network.links[group.link].edges[-1]}_{lane}") for lane in group.lanes)
+    def last_edge(link: int) -> str:
+        return network.links[link].edges[-1]
+
+    def at_line(kind: str, link: int, lanes: Sequence[int]) -> tuple[str, ...]:
+        return tuple(_named(kind, f"{last_edge(link)}_{lane}") for lane in lanes)
 
     pieces = [_zones(network, link) for link in network.links]
 
@@ -89,8 +94,11 @@ def ids(network: Network) -> DetectorIds:
     def before(link: Link) -> Callable[[str], Sequence[int]]:
         return lambda edge: () if edge == link.edges[-1] else network.edge_lanes[edge]
 
-    def at_line(group: LaneGroup) -> Callable[[str], Sequence[int]]:
-        return lambda edge: group.lanes if edge == network.links[group.link].edges[-1] else ()
+    def of_set(link: int, lane_set: LaneSet) -> Callable[[str], Sequence[int]]:
+        return lambda edge: lane_set.lanes if edge == last_edge(link) else ()
+
+    groups = network.groups
+    sets = list(zip(network.set_link.tolist(), network.lane_sets, strict=True))
 
     return DetectorIds(
         entry=tuple(on("entry", link.edges[0]) for link in network.links),
@@ -99,15 +107,16 @@ def ids(network: Network) -> DetectorIds:
         area=tuple(
             tuple(name for edge, _ in network.watched(link) for name in on("area", edge)) for link in network.links
         ),
-        group=tuple(of_group("area", group) for group in network.groups),
-        group_stop_line=tuple(of_group("stop", group) for group in network.groups),
+        group=tuple(at_line("area", group.link, group.lanes) for group in groups),
+        group_stop_line=tuple(at_line("stop", group.link, group.lanes) for group in groups),
+        set_stop_line=tuple(at_line("stop", link, lane_set.lanes) for link, lane_set in sets),
         upstream=tuple(
             tuple(name for edge, _ in network.watched(link) if edge != link.edges[-1] for name in on("area", edge))
             for link in network.links
         ),
         joining=tuple(tuple(_named("side", lane) for lane in link.joining) for link in network.links),
         parting=tuple(tuple(_named("side", lane) for lane in link.parting) for link in network.links),
-        group_zone=tuple(in_zones(group.link, at_line(group)) for group in network.groups),
+        set_zone=tuple(in_zones(link, of_set(link, lane_set)) for link, lane_set in sets),
         upstream_zone=tuple(in_zones(index, before(link)) for index, link in enumerate(network.links)),
         amid=tuple(tuple(_named("amid", lane) for lane in lanes) for lanes in _amid(network)),
     )

@@ -76,7 +76,8 @@ class Estimator:
         length_m = np.array([link.length_m for link in network.links])
         speed_m_s = np.array([link.free_speed_m_s for link in known.links])
         self._watched_veh = network.watched_veh
-        group_m, before_m = network.watched_lane_m
+        set_m, before_m = network.watched_lane_m
+        group_m = np.bincount(network.set_group, set_m, len(network.groups))
         lane_m = before_m + np.bincount(network.group_link, group_m, links)
         self._group_veh = np.maximum(self._watched_veh[network.group_link] * group_m / lane_m[network.group_link], 1.0)
         """(G,) vehicles that the part of each lane group in view holds."""

@@ -172,7 +172,7 @@ class Counting:
 
 def test_zones_are_read_before_those_junctions_that_are_asked_for_and_no_others(utn17: Network) -> None:
     sumo = Counting()
-    eyes, names = Eyes(utn17, ids(utn17), sumo), ids(utn17).group_zone
+    eyes, names = Eyes(utn17, ids(utn17), sumo), ids(utn17).set_zone
     own = utn17.link_junction[utn17.group_link]
     for junction in range(len(utn17.junctions)):
         sumo.asked.clear()
@@ -248,7 +248,7 @@ def test_zones_cover_what_the_detectors_see_and_nothing_twice(make: Callable[[Pa
         )
     named = ids(net)
     assert sum(map(len, zones.values())) == sum(
-        len(names) for rows in (named.group_zone, named.upstream_zone) for zone in rows for names in zone
+        len(names) for rows in (named.set_zone, named.upstream_zone) for zone in rows for names in zone
     )
     assert zones.keys() == areas.keys()
     for lane, ((begin_m, end_m),) in areas.items():

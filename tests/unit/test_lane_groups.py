@@ -271,5 +271,5 @@ def test_with_groups_vehicles_are_conserved_and_fit(pockets: Network, seed: int)
 
 
 def test_a_lane_that_no_turn_uses_gives_nothing(utn17: Network) -> None:
-    narrow = replace(utn17, groups=tuple(replace(group, lanes=group.lanes[:1]) for group in utn17.groups))
+    narrow = replace(utn17, lane_sets=tuple(replace(each, lanes=each.lanes[:1]) for each in utn17.lane_sets))
     assert narrow.group_saturation_flow_veh_s == pytest.approx(utn17.group_saturation_flow_veh_s / 2)

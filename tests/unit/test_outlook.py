@@ -69,7 +69,7 @@ class Road:
         one[self.link] = 1.0
         return replace(
             scene(self.network, self.now_s),
-            group_zone_veh=np.outer(self.group_share, self._zone_veh()),
+            set_zone_veh=np.outer(self.group_share, self._zone_veh()),
             x_veh=self.on_it() * one,
             entered_veh=self._since(0.0) * one,
         )
@@ -136,7 +136,7 @@ def test_who_is_by_the_line_stands_by_lane_group_as_seen(utn17: Network) -> None
     outlook = Outlook(utn17, streams, BINS, BIN_S)
     near_veh = np.arange(len(utn17.groups), dtype=float)
     seen_veh = np.bincount(utn17.group_link, near_veh, len(utn17.links))
-    still = replace(scene(utn17), group_zone_veh=by_the_line(near_veh), x_veh=seen_veh, entered_veh=seen_veh)
+    still = replace(scene(utn17), set_zone_veh=by_the_line(near_veh), x_veh=seen_veh, entered_veh=seen_veh)
     for _ in range(30):
         stand, come = looked(outlook, still)
     assert np.bincount(streams.group, stand, len(utn17.groups)) == pytest.approx(near_veh)
@@ -153,7 +153,7 @@ def test_a_queue_that_reaches_back_out_of_sight_follows_whom_the_detectors_see(u
     one[link] = 1.0
     groups = utn17.group_link == link
     zone_veh = np.outer(groups / groups.sum(), storage_veh * np.diff(ends_m) / road.length_m)
-    full = replace(scene(utn17), group_zone_veh=zone_veh, x_veh=storage_veh * one, entered_veh=storage_veh * one)
+    full = replace(scene(utn17), set_zone_veh=zone_veh, x_veh=storage_veh * one, entered_veh=storage_veh * one)
     for _ in range(30):
         stand, come = looked(outlook, full)
     seen_bins = int(AREA_REACH_M / road.free_speed_m_s / BIN_S) + 1
@@ -197,7 +197,7 @@ def test_whom_a_neighbour_sends_arrives_after_the_way_along_the_link(utn17: Netw
         (found,) = np.flatnonzero(come.sum(axis=0))
         # A bin has gone by since.
         assert found - place + 1 == pytest.approx(utn17.free_time_s[link] / BIN_S, abs=0.5)
-        share, _ = streams.shares(utn17.fraction)
+        share = streams.shares(utn17.fraction).of_link
         assert come[:, found] == pytest.approx(np.where(streams.link == link, 3.0 * share, 0.0))
 
 

@@ -34,7 +34,7 @@ def held(
     zone[:, 0], upstream[0, 2] = own, before
     share, x = np.array([*cut, 1 - sum(cut)]), np.array([sum(own) + before + far])
     room, link = np.full(3, ROOM_VEH), np.zeros(3, dtype=np.int64)
-    return held_up(zone, upstream, x, share, room, np.array([BEFORE_VEH]), link)
+    return held_up(zone.sum(axis=1), upstream, x, share, room, np.array([BEFORE_VEH]), link)
 
 
 @given(own=st.tuples(veh, veh, veh), before=veh, far=veh, cut=st.tuples(st.floats(0.1, 0.4), st.floats(0.1, 0.4)))
@@ -83,7 +83,7 @@ def test_where_lanes_never_part_nobody_is_held_up(utn17: Network) -> None:
     zone = np.full((len(utn17.groups), len(ZONES_M)), 20.0)
     share, x = utn17.group_shares(utn17.fraction), utn17.storage_veh
     nobody = np.zeros((len(utn17.links), len(ZONES_M)))
-    shut, weight = held_up(zone, nobody, x, share, *rooms_veh(utn17), utn17.group_link)
+    shut, weight = held_up(zone.sum(axis=1), nobody, x, share, *rooms_veh(utn17), utn17.group_link)
     assert not shut.any()
     assert (weight == 1).all()
 
@@ -108,7 +108,7 @@ def test_nobody_is_expected_in_other_lanes_while_a_full_pocket_stands_in_the_way
     zone[pocket, 0] = group_veh[pocket] * full
     upstream[link, 2] = before_veh[link]
     x = np.bincount(pockets.group_link, zone.sum(axis=1), len(before_veh)) + upstream.sum(axis=1)
-    view = replace(scene(pockets), group_zone_veh=zone, link_zone_veh=upstream, x_veh=x)
+    view = replace(scene(pockets), set_zone_veh=zone, link_zone_veh=upstream, x_veh=x)
     outlook = Outlook(pockets, streams, 25, 2.0)
     _, come, weight = outlook.look(view, view.zone_veh(view.free))
     others = (streams.link == link) & (streams.group != pocket)

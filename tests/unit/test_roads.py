@@ -19,7 +19,7 @@ from tests.integration import odd_nets
 from tests.integration.odd_nets import ARM_M, NO_TURNAROUNDS, TWO_STAGES, Streets, retime, row, tl_logic
 from utn_sumo.contract import EXIT, Link, Network
 from utn_sumo.network import MOTOR, roads
-from utn_sumo.network.roads import lane_groups
+from utn_sumo.network.lanes import lane_groups
 from utn_sumo.sumo_tools import sumo_binary
 
 Make = Callable[[Path], Any]

@@ -18,6 +18,7 @@ from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
 from utn_controllers.scheduled.ending import Ending, lost, needing, staying
 from utn_controllers.scheduled.execution import Scheduled
+from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.moves import Moves, Rules, going
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
@@ -82,7 +83,9 @@ class Crossing:
                 moves = np.vstack([moves, shares])
         first = np.array([0, stages])
         who = going(moves, stages, clearing, clearance)
-        return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least))
+        shape = stages, moves.shape[1]
+        gaps = Gaps(np.zeros(shape), np.full((*shape, 1), -1), np.zeros(stages, dtype=np.bool_), 2.0)
+        return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least), gaps)
 
     def decide(
         self,
@@ -440,16 +443,19 @@ class TestStreams:
             & (streams.next_link == network.turn_next[turns, None])
             & (network.serves[np.ix_(streams.stage, turns)].T[:, :, None] == streams.serves).all(axis=1)
         )
-        assert (same.sum(axis=1) == 1).all()
-        assert same.any(axis=0).all()
-        of_link, of_group = streams.shares(fraction)
-        assert of_link == pytest.approx(same.T.astype(float) @ fraction[turns])
+        # From each lane set that a turn goes from it is in a stream of its own.
+        sets = np.array([[turn in each.turns for each in network.lane_sets] for turn in turns])
+        from_set = sets[:, streams.lane_set]
+        assert (same & from_set).any(axis=1).all()
+        assert (same & from_set).any(axis=0).all()
+        shares = streams.shares(fraction)
+        alike = (same.T.astype(int) @ same) > 0
+        assert alike @ shares.of_link == pytest.approx(same.T.astype(float) @ fraction[turns])
         links = np.bincount(network.turn_link[turns], fraction[turns], len(network.links))
-        assert np.bincount(streams.link, of_link, len(network.links)) == pytest.approx(links)
-        whole = np.bincount(network.turn_group, fraction, len(network.groups))
-        groups = np.bincount(network.turn_group[turns], fraction[turns], len(network.groups))
-        shared = np.bincount(streams.group, of_group, len(network.groups))
-        assert (shared * whole)[whole > 0] == pytest.approx(groups[whole > 0])
+        assert np.bincount(streams.link, shares.of_link, len(network.links)) == pytest.approx(links)
+        assert shares.of_set * shares.set_of_link[streams.lane_set] == pytest.approx(shares.of_link)
+        every = np.bincount(network.set_link, shares.set_of_link, len(network.links))
+        assert every == pytest.approx(np.bincount(network.turn_link, fraction, len(network.links)))
         # One junction's after the other's.
         owner = network.link_junction[streams.link]
         for index, (a, b) in enumerate(zip(streams.first[:-1], streams.first[1:], strict=True)):
@@ -594,7 +600,7 @@ def drawn(network: Network, seed: int) -> Scene:
     return replace(
         scene(network, 20.0, np.array([rng.choice(junction.stages) for junction in network.junctions])),
         free=rng.uniform(size=len(network.junctions)) < 0.8,
-        group_zone_veh=by_the_line(near_veh),
+        set_zone_veh=by_the_line(near_veh),
         x_veh=seen_veh,
         entered_veh=seen_veh,
     )
@@ -637,7 +643,7 @@ class TestExecution:
             execution = Scheduled(utn17, bounds=bounds)
             execution.begin(plan, Estimator(utn17, utn17).initial())
             went_veh = np.ones(len(utn17.groups))
-            view = replace(scene(utn17, 500.0), group_zone_veh=by_the_line(near_veh), left_veh=went_veh)
+            view = replace(scene(utn17, 500.0), set_zone_veh=by_the_line(near_veh), left_veh=went_veh)
             assert (execution.wish(view) != view.stage).all() == leaves
             # It has not been reached yet.
             view = replace(view, time_s=2.0)
@@ -653,7 +659,7 @@ class TestExecution:
             x_veh[ahead] = taken * utn17.storage_veh[ahead]
             near_veh = np.zeros(len(utn17.groups))
             near_veh[streams.group[stream]] = 8.0
-            execution.wish(replace(scene(utn17), group_zone_veh=by_the_line(near_veh), x_veh=x_veh))
+            execution.wish(replace(scene(utn17), set_zone_veh=by_the_line(near_veh), x_veh=x_veh))
             assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
 
     @pytest.mark.parametrize("blocking", [0.0, 4.0])
@@ -670,7 +676,7 @@ class TestExecution:
         execution, chosen = Scheduled(utn17, blocking=blocking), []
         for now_s in np.arange(0.0, 300.0, 2.0):
             went_veh = np.full(len(utn17.groups), now_s)
-            view = replace(scene(utn17, now_s), group_zone_veh=by_the_line(near_veh), left_veh=went_veh)
+            view = replace(scene(utn17, now_s), set_zone_veh=by_the_line(near_veh), left_veh=went_veh)
             chosen.append(int(execution.wish(view)[junction]))
         goes = [name.index(hemmed) in utn17.turn_link[utn17.serves[stage]] for stage in chosen]
         assert goes[-1] or not blocking
@@ -693,7 +699,7 @@ class TestExecution:
         for now_s in np.arange(0.0, 300.0, 2.0):
             view = replace(
                 scene(utn17, now_s),
-                group_zone_veh=by_the_line(near_veh),
+                set_zone_veh=by_the_line(near_veh),
                 x_veh=full * utn17.storage_veh,
                 left_veh=np.full(len(utn17.groups), now_s),
             )
@@ -723,7 +729,7 @@ class TestExecution:
         for step, now_s in enumerate(np.arange(0.0, 200.0, 2.0)):
             there_veh = near_veh * np.where(utn17.group_link == name.index("9"), step % 10 > 0, 1.0)
             went_veh = np.full(len(utn17.groups), now_s)
-            view = replace(scene(utn17, now_s), group_zone_veh=by_the_line(there_veh), left_veh=went_veh)
+            view = replace(scene(utn17, now_s), set_zone_veh=by_the_line(there_veh), left_veh=went_veh)
             if step % 10:
                 served = (
                     utn17.turn_link[utn17.serves[int(execution.wish(view)[junction])]].tolist() == [name.index("8")] * 2
@@ -746,7 +752,7 @@ class TestExecution:
         def stay(now_s: float, begin_s: Floats) -> bool:
             left_veh = np.full(len(utn17.groups), now_s * goes)
             zone_veh = by_the_line(near_veh)
-            view = replace(scene(utn17, now_s), group_zone_veh=zone_veh, left_veh=left_veh, begin_s=begin_s)
+            view = replace(scene(utn17, now_s), set_zone_veh=zone_veh, left_veh=left_veh, begin_s=begin_s)
             return bool((execution.wish(view) == view.stage).all())
 
         assert all(stay(now_s, begin_s) for now_s in np.arange(30.0, 38.0, 2.0))

@@ -26,7 +26,7 @@ QUEUE_VEH = 8.0
 def left_turns(network: Network) -> list[int]:
     """Lane groups that give way in one stage and have another one to themselves."""
     streams = Streams(network)
-    return np.flatnonzero(Yielding(network, streams, np.ones((len(streams.stage), 9)))._gives_way.any(axis=0)).tolist()
+    return np.flatnonzero(Yielding(network, streams, np.ones((len(streams.stage), 9))).learnt.any(axis=0)).tolist()
 
 
 def through_stage(network: Network, group: int) -> int:
@@ -101,7 +101,7 @@ def test_who_finds_no_gap_gets_the_stage_of_their_own(goes: bool, changes: bool,
     )
     execution, wishes = Scheduled(arrows), []
     for now_s in np.arange(0.0, 120.0, 2.0):
-        view = replace(scene(arrows, now_s, shown), group_zone_veh=by_the_line(near_veh), left_veh=flow_veh_s * now_s)
+        view = replace(scene(arrows, now_s, shown), set_zone_veh=by_the_line(near_veh), left_veh=flow_veh_s * now_s)
         wishes.append(int(execution.wish(view)[junction]))
     assert wishes[0] == stage
     assert (wishes[-1] != stage) == changes

@@ -19,18 +19,18 @@ class Scene:
     free: Bools
     waiting_veh: Floats
     near_veh: Floats
-    group_zone_veh: Floats
+    set_zone_veh: Floats
     link_zone_veh: Floats
     x_veh: Floats
     gap_s: Floats
     entered_veh: Floats
     left_veh: Floats
-    group_junction: Ints
+    set_junction: Ints
     link_junction: Ints
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
         return (
-            np.where(junctions[self.group_junction][:, None], self.group_zone_veh, 0.0),
+            np.where(junctions[self.set_junction][:, None], self.set_zone_veh, 0.0),
             np.where(junctions[self.link_junction][:, None], self.link_zone_veh, 0.0),
         )
 
@@ -42,7 +42,7 @@ class Scene:
 
 
 def by_the_line(veh: Floats) -> Floats:
-    """(G, zones) everybody of a lane group (G,) in the zone next to the stop line."""
+    """(L, zones) everybody of a lane set (L,) in the zone next to the stop line."""
     return np.pad(veh[:, None], ((0, 0), (0, len(ZONES_M) - 1)))
 
 
@@ -53,7 +53,7 @@ def scene(
 
     Unless it is said otherwise.
     """
-    groups = np.zeros(len(network.groups))
+    groups, sets = np.zeros(len(network.groups)), np.zeros(len(network.lane_sets))
     everybody = groups + veh
     return Scene(
         time_s,
@@ -62,12 +62,12 @@ def scene(
         np.ones(len(network.junctions), dtype=bool),
         everybody,
         everybody,
-        by_the_line(everybody),
+        by_the_line(sets + veh),
         np.zeros((len(network.links), len(ZONES_M))),
         np.zeros(len(network.links)),
         groups + gap_s,
         np.zeros(len(network.links)),
-        groups,
-        network.link_junction[network.group_link],
+        sets,
+        network.link_junction[network.set_link],
         network.link_junction,
     )

@@ -6,6 +6,7 @@ and others 2012).
 
 streams.py      what queues before a junction and moves together
 moves.py        what moves in a stage, and in the clearance between two
+gaps.py         who goes in the gaps of what comes towards him
 outlook.py      who stands and who comes, by stream
 standstill.py   who has green and does not go
 traffic.py      what the programme has of those who stand and come

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.scheduled.ending import Ending
+from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.programme import schedules
@@ -72,6 +73,7 @@ class Scheduled:
         stages = self._streams.stage
         moves = Moves(network, self._streams, BIN_S)
         self._yielding = Yielding(network, self._streams, moves.share)
+        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S)
         self._rules = Rules(
             stages,
             self._streams.first_stage,
@@ -82,6 +84,7 @@ class Scheduled:
             moves.row,
             moves.bins,
             np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
+            self._giving.gaps,
         )
         self._ending = Ending(self._streams, moves.bins)
         self._plan = np.full((len(network.junctions), bins), -1)
@@ -97,7 +100,8 @@ class Scheduled:
         """Take up the turning fractions as they are at present, and the plan's greens as bounds if they are to be."""
         self._outlook.take_up(state.fraction)
         self._take_up()
-        self._ending.take_up(self._outlook.come_veh, self._flow)
+        flow_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]
+        self._ending.take_up(self._outlook.come_veh, self.settings.discharge * flow_veh_s * BIN_S)
         if self.settings.bounds == "plan":
             self._green_s = plan.green_s
 
@@ -108,7 +112,7 @@ class Scheduled:
         stand, come, held = outlook.look(view, zones)
         stuck = self._standstill.look(view, present, stand)
         self._yielding.look(view, view.free, present, zones[0])
-        shares = outlook.of_link, outlook.group_share
+        shares = outlook.shares.of_link, outlook.shares.set_of_link
         worth, most = self._worth.look(view.time_s, view.free, zones, view.x_veh, shares, self._most, stuck, held)
         if self._green_s is None:
             rest = self._endless
@@ -133,16 +137,16 @@ class Scheduled:
 
     def _warm_up(self) -> None:
         """Have the machine code made now, not at the first decision."""
-        none, nobody = np.zeros(len(self.network.links)), np.zeros(len(self.network.groups))
+        none, nobody = np.zeros(len(self.network.links)), np.zeros(len(self.network.lane_sets))
         stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
-        zones = np.zeros((len(self.network.groups), len(ZONES_M))), np.zeros((len(none), len(ZONES_M)))
+        zones = np.zeros((len(self.network.lane_sets), len(ZONES_M))), np.zeros((len(none), len(ZONES_M)))
         self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody))
 
     def _take_up(self) -> None:
-        flow_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]
-        self._flow = self.settings.discharge * flow_veh_s * BIN_S
-        self._most = self._flow * self._outlook.of_group
+        self._giving.take_up(self._outlook.shares.way_of_set)
+        flow_veh_s = self.network.set_saturation_flow_veh_s[self._streams.lane_set]
+        self._most = self.settings.discharge * flow_veh_s * BIN_S * self._outlook.shares.of_set
 
     def _orders(self) -> Bools:
         """(S, most stages) whether its junction's nth stage may come after each."""

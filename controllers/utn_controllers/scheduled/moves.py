@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo import clearances
 from utn_sumo.clearances import GREEN, Phases, Times
@@ -41,6 +42,7 @@ class Rules(NamedTuple):
     """(S, most stages of a junction) bins of that clearance: one or more."""
     least: Ints
     """(S,) bins of green, one or more."""
+    gaps: Gaps
 
 
 class Moves:

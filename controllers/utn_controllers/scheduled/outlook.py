@@ -56,18 +56,19 @@ class Outlook:
         """Vehicles a bin that come onto each link of late, and of these those that schedules said."""
         self.sent_veh = np.zeros((len(streams.link), bins))
         """(N, K) vehicles that each stream's schedule sends off in each bin, from the one that it was made in on."""
-        self._room = rooms_veh(network)
+        set_veh, before_veh = rooms_veh(network)
+        self._room = np.bincount(network.set_group, set_veh, len(network.groups)), before_veh
         self.take_up(network.fraction)
 
     @property
     def come_veh(self) -> Floats:
         """(N,) vehicles that have come in a bin of late."""
-        return np.asarray(self._rate[0][self.streams.link] * self.of_link)
+        return np.asarray(self._rate[0][self.streams.link] * self.shares.of_link)
 
     def take_up(self, fraction: Floats) -> None:
         """Go by these turning fractions (M,) from now on."""
-        self.of_link, self.of_group = self.streams.shares(fraction)
-        self.group_share = self.network.group_shares(fraction)
+        self.shares = self.streams.shares(fraction)
+        self._group_share = self.network.group_shares(fraction)
 
     def look(self, view: Seen, zones: tuple[Floats, Floats]) -> tuple[Floats, Floats, Floats]:
         """(N,) vehicles by the stop line, (N, K) those that could be in each bin. A bin has gone by since.
@@ -93,12 +94,13 @@ class Outlook:
             *self._room,
             network.link_junction,
             network.group_link,
+            network.set_group,
             streams.link,
-            streams.group,
+            streams.lane_set,
             streams.next_link,
-            self.of_link,
-            self.of_group,
-            self.group_share,
+            self.shares.of_link,
+            self.shares.of_set,
+            self._group_share,
             self.bin_s,
         )
         return stand, come, held
@@ -133,19 +135,18 @@ def _look(
     upstream_room: Floats,
     junction: Ints,
     group_link: Ints,
+    set_group: Ints,
     stream_link: Ints,
-    stream_group: Ints,
+    stream_set: Ints,
     next_link: Ints,
     of_link: Floats,
-    of_group: Floats,
+    of_set: Floats,
     share: Floats,
     bin_s: float,
 ) -> tuple[Floats, Floats, Floats]:
     links, bins = len(x), sent.shape[1]
     asked = free[junction]
-    far = x - upstream.sum(axis=1)
-    for group in range(len(zone)):
-        far[group_link[group]] -= zone[group].sum()
+    seen, far = _in_sight(zone, upstream, x, set_group, group_link)
     coming = np.zeros((links, bins))
     for link in range(links):
         came[now, link] = max(entered[link] - before[link], 0.0)
@@ -153,22 +154,33 @@ def _look(
         if asked[link] and due_s[link] > sight_s[link]:
             _arrive(came[:, link], now, max(far[link], 0.0), sight_s[link], due_s[link], coming[link], bin_s)
     _send(asked, sent, next_link, came[now], rate, due_s, coming, bin_s)
-    shut, held = held_up(zone, upstream, x, share, room, upstream_room, group_link)
+    shut, held = held_up(seen, upstream, x, share, room, upstream_room, group_link)
     stand, come = np.zeros(len(stream_link)), np.zeros((len(stream_link), bins))
     for stream in range(len(stream_link)):
-        group, link = stream_group[stream], stream_link[stream]
+        lane_set, link = stream_set[stream], stream_link[stream]
         if not asked[link]:
             continue
-        of_upstream = (1 - shut[group]) * of_link[stream]
-        stand[stream] = of_group[stream] * zone[group, 0] + of_upstream * upstream[link, 0]
+        of_upstream = (1 - shut[set_group[lane_set]]) * of_link[stream]
+        stand[stream] = of_set[stream] * zone[lane_set, 0] + of_upstream * upstream[link, 0]
         for place in range(bins):
             come[stream, place] = of_upstream * coming[link, place]
         for part in range(1, zone.shape[1]):
-            veh = of_group[stream] * zone[group, part] + of_upstream * upstream[link, part]
+            veh = of_set[stream] * zone[lane_set, part] + of_upstream * upstream[link, part]
             if veh > 0:
                 for place in range(bins):
                     come[stream, place] += veh * arrival[link, part, place]
     return stand, come, held
+
+
+@compiled
+def _in_sight(zone: Floats, upstream: Floats, x: Floats, set_group: Ints, group_link: Ints) -> tuple[Floats, Floats]:
+    """(G,) vehicles that are seen on the lanes of each lane group, (Z,) those of each link that are not in sight."""
+    seen, far = np.zeros(len(group_link)), x - upstream.sum(axis=1)
+    for lane_set, group in enumerate(set_group):
+        seen[group] += zone[lane_set].sum()
+    for group, link in enumerate(group_link):
+        far[link] -= seen[group]
+    return seen, far
 
 
 @compiled

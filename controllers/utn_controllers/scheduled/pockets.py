@@ -23,30 +23,30 @@ stage put off again and again.
 
 
 def rooms_veh(network: Network) -> tuple[Floats, Floats]:
-    """(G,) vehicles that the lanes in sight hold of each lane group, (Z,) and of each link before its lanes part."""
+    """(L,) vehicles that the lanes in sight hold of each lane set, (Z,) and of each link before its lanes part."""
     lane_m = [
         sum(network.edge_length_m[edge] * len(network.edge_lanes[edge]) for edge in link.edges)
         for link in network.links
     ]
     jam_veh_m = network.storage_veh / np.array(lane_m)
-    group_m, before_m = network.watched_lane_m
-    return group_m * jam_veh_m[network.group_link], before_m * jam_veh_m
+    set_m, before_m = network.watched_lane_m
+    return set_m * jam_veh_m[network.set_link], before_m * jam_veh_m
 
 
 @compiled
 def held_up(
-    zone: Floats, upstream: Floats, x: Floats, share: Floats, room: Floats, before: Floats, group_link: Ints
+    seen: Floats, upstream: Floats, x: Floats, share: Floats, room: Floats, before: Floats, group_link: Ints
 ) -> tuple[Floats, Floats]:
     """(G,) how few come into a lane group from before the lanes part, 0 to 1; (G,) what a vehicle in it weighs.
 
-    By the vehicles in zones (G, zones), (Z, zones) and on links `x` (Z,), the lane groups' `share` (G,) of the traffic,
-    and the `room` of their lanes (G,) and of those `before` (Z,).
+    By the vehicles `seen` on the lanes of each (G,), in the zones before them (Z, zones) and on links `x` (Z,), the
+    `share` (G,) of the traffic that they have, and the `room` of their lanes (G,) and of those `before` (Z,).
     """
-    holds, shuts, weight = np.zeros(len(zone)), np.zeros(len(zone)), np.ones(len(zone))
+    holds, shuts, weight = np.zeros(len(seen)), np.zeros(len(seen)), np.ones(len(seen))
     within, stuck_veh, stuck_share = np.zeros(len(x)), np.zeros(len(x)), np.zeros(len(x))
     held, shut = np.zeros(len(x)), np.zeros(len(x))
     for group, link in enumerate(group_link):
-        veh = zone[group].sum()
+        veh = seen[group]
         within[link] += veh
         if before[link] > 0:
             own, dense = veh / room[group], upstream[link].sum() / before[link]

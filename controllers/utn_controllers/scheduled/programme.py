@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from utn_controllers.scheduled.gaps import Gaps, let_go
 from utn_controllers.scheduled.moves import Rules
 from utn_controllers.scheduled.traffic import Traffic
 from utn_sumo.compiling import compiled
@@ -69,14 +70,14 @@ def _schedule(
     if called.any():
         traffic = _sums(rules.moves[low : low + stages], stand, come, worth, ends, most)
         # What was best a bin ago is seldom far from what is best now.
-        known = _waited(plan, rules.moves, traffic)
+        known = _waited(plan, rules, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
             chosen = _search(present, rest, low, called, rules, traffic, limit, plan)
             if chosen >= 0:
                 break
     else:
         plan[:] = low + present
-    _send_off(plan, rules.moves, stand, come, most, sent)
+    _send_off(plan, rules, stand, come, most, sent)
     return chosen
 
 
@@ -118,6 +119,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
     after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     others, veh = np.empty(stages, np.int64), np.empty(streams)
+    gaps, pace, want = rules.gaps, np.ones(streams), np.zeros(streams)
     for begin in range(bins):
         for stage in range(stages):
             spent = cost[begin, stage]
@@ -128,7 +130,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
                 _lead(
                     before, end, begin, low + was, clearing[low + was, stage], moves, going, come, came, most,
-                    queue[before, was], queue[begin, stage],
+                    queue[before, was], queue[begin, stage], gaps, pace, want,
                 )  # fmt: skip
             # What the queues weigh that move, and that have red: these in `veh` as they stood when it began.
             moving, held = 0.0, 0.0
@@ -147,6 +149,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     others[nexts], nexts = other, nexts + 1
             may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
             now = begin
+            pace[:] = 1.0
             while now < bins and spent < best - ALIKE:
                 if now >= may_end:
                     # It ends here: others begin after their clearance, where that is the best way there.
@@ -184,11 +187,16 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 spent += _held(stage, grown, paid, now, now + 1, held)
                 held += grown[stage, now + 1] - grown[stage, now]
                 moving = 0.0
-                for place in range(greens):
-                    stream = going[row, place]
-                    leaves = moves[row, stream] * most[stream]
-                    veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
-                    moving += worth[stream] * veh[stream]
+                if gaps.some[row]:
+                    let_go(row, now, veh, come, most, moves, going, gaps, pace, want)
+                    for place in range(greens):
+                        moving += worth[going[row, place]] * veh[going[row, place]]
+                else:
+                    for place in range(greens):
+                        stream = going[row, place]
+                        leaves = moves[row, stream] * most[stream]
+                        veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
+                        moving += worth[stream] * veh[stream]
                 now += 1
                 spent += moving
             if now == bins:
@@ -296,17 +304,25 @@ def _won(
 @compiled
 def _lead(
     before: int, end: int, begin: int, row: int, clearing: int, moves: Floats, going: Ints, come: Floats,
-    came: Floats, most: Floats, was: Floats, veh: Floats,
+    came: Floats, most: Floats, was: Floats, veh: Floats, gaps: Gaps, pace: Floats, want: Floats,
 ) -> None:  # fmt: skip
     """Fills in the queues `veh` when a stage begins, by those that there were when the stage `before` it did."""
     for stream in range(len(veh)):
         veh[stream] = was[stream] + came[stream, begin] - came[stream, before]
     place = 0
     while going[row, place] >= 0:
-        stream = going[row, place]
-        veh[stream] = was[stream]
+        veh[going[row, place]] = was[going[row, place]]
+        place += 1
+    if gaps.some[row]:
+        pace[:] = 1.0
         for now in range(before, end):
-            veh[stream] = max(veh[stream] + come[stream, now] - moves[row, stream] * most[stream], 0.0)
+            let_go(row, now, veh, come, most, moves, going, gaps, pace, want)
+    place = 0
+    while going[row, place] >= 0:
+        stream = going[row, place]
+        if not gaps.some[row]:
+            for now in range(before, end):
+                veh[stream] = max(veh[stream] + come[stream, now] - moves[row, stream] * most[stream], 0.0)
         veh[stream] += came[stream, begin] - came[stream, end]
         place += 1
     place = 0
@@ -320,19 +336,34 @@ def _lead(
 
 
 @compiled
-def _waited(plan: Ints, moves: Floats, traffic: Traffic) -> float:
+def _waited(plan: Ints, rules: Rules, traffic: Traffic) -> float:
     """What is waited by a `plan`."""
-    total = 0.0
-    for stream in range(len(traffic.stand)):
-        veh, waited = traffic.stand[stream], 0.0
-        for place in range(len(plan)):
-            veh += traffic.come[stream, place]
-            share = moves[plan[place], stream] if plan[place] >= 0 else 0.0
-            if share > 0:
-                veh = max(veh - share * traffic.most[stream], 0.0)
-            waited += veh
-        total += traffic.worth[stream] * waited + traffic.ends[stream] * veh
+    total, veh = 0.0, traffic.stand.copy()
+    pace, want = np.ones(len(veh)), np.zeros(len(veh))
+    for place in range(len(plan)):
+        _follow(plan, place, rules, veh, traffic.come, traffic.most, pace, want)
+        for stream in range(len(veh)):
+            total += traffic.worth[stream] * veh[stream]
+    for stream in range(len(veh)):
+        total += traffic.ends[stream] * veh[stream]
     return total
+
+
+@compiled
+def _follow(
+    plan: Ints, place: int, rules: Rules, veh: Floats, come: Floats, most: Floats, pace: Floats, want: Floats
+) -> None:
+    """Brings the vehicles `veh` (n,) up to the end of one bin of a `plan`."""
+    row, stages = plan[place], len(rules.gaps.some)
+    if place == 0 or plan[place - 1] != row:
+        pace[:] = 1.0
+    some_wait = 0 <= row < stages and rules.gaps.some[row]
+    for stream in range(len(veh)):
+        share = rules.moves[row, stream] if row >= 0 else 0.0
+        if not (some_wait and share > 0):
+            veh[stream] = max(veh[stream] + come[stream, place] - share * most[stream], 0.0)
+    if some_wait:
+        let_go(row, place, veh, come, most, rules.moves, rules.going, rules.gaps, pace, want)
 
 
 @compiled
@@ -353,12 +384,13 @@ def _trace(present: int, begin: int, stage: int, low: int, whence: Ints, clearin
 
 
 @compiled
-def _send_off(plan: Ints, moves: Floats, stand: Floats, come: Floats, most: Floats, sent: Floats) -> None:
+def _send_off(plan: Ints, rules: Rules, stand: Floats, come: Floats, most: Floats, sent: Floats) -> None:
     """Fills `sent` with what leaves by a `plan`."""
-    for stream in range(len(stand)):
-        veh = stand[stream]
-        for place, row in enumerate(plan):
-            veh += come[stream, place]
-            leaves = min(veh, moves[row, stream] * most[stream]) if row >= 0 else 0.0
-            sent[stream, place] = leaves
-            veh -= leaves
+    veh = stand.copy()
+    pace, want = np.ones(len(veh)), np.zeros(len(veh))
+    for place in range(len(plan)):
+        for stream in range(len(veh)):
+            sent[stream, place] = veh[stream] + come[stream, place]
+        _follow(plan, place, rules, veh, come, most, pace, want)
+        for stream in range(len(veh)):
+            sent[stream, place] -= veh[stream]

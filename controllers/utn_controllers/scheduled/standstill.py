@@ -55,7 +55,7 @@ class Standstill:
         self._fed[network.turn_next[network.turn_next != EXIT]] = True
         self._storage_veh = network.storage_veh
         self._junction = network.link_junction
-        self._group_link = network.group_link
+        self._set_link = network.set_link
         self._went_s = np.zeros(len(network.links))
         self._left_veh = np.zeros(len(network.links))
 
@@ -70,7 +70,7 @@ class Standstill:
                 present,
                 view.begin_s,
                 view.left_veh,
-                self._group_link,
+                self._set_link,
                 view.x_veh,
                 self._storage_veh,
                 stand,
@@ -103,8 +103,8 @@ def _look(
     time_s: float,
     row: Ints,
     begin_s: Floats,
-    group_left: Floats,
-    group_link: Ints,
+    set_left: Floats,
+    set_link: Ints,
     x: Floats,
     storage: Floats,
     stand: Floats,
@@ -120,8 +120,8 @@ def _look(
     gap_s: Floats,
 ) -> Bools:
     left, taken = np.zeros(len(x)), x / storage
-    for group, link in enumerate(group_link):
-        left[link] += group_left[group]
+    for lane_set, link in enumerate(set_link):
+        left[link] += set_left[lane_set]
     waiting, stuck = np.zeros(len(left)), np.zeros(len(stand), np.bool_)
     for_a_gap = np.empty(len(left), np.bool_)
     for link in range(len(left)):

@@ -24,22 +24,22 @@ STARVED_S = 120.0
 
 
 class Worth:
-    """Keeps how dense lane groups have been of late, and when they were last empty."""
+    """Keeps how dense lane sets have been of late, and when they were last empty."""
 
     def __init__(
         self, network: Network, streams: Streams, *, crowding: float, blocking: float, starving: float, full: float
     ):
         self._network, self._streams = network, streams
         self._settings = crowding, blocking, starving, full
-        self._group_junction = network.link_junction[network.group_link]
-        group_veh, before_veh = rooms_veh(network)
-        self._room = group_veh, before_veh
-        self._dense = np.zeros(len(network.groups))
-        """(G,) share of their room in sight that vehicles have taken up of late."""
-        self._looked_s = np.zeros(len(network.groups))
-        """(G,) when that was looked at."""
-        self._empty_s = np.zeros(len(network.groups))
-        """(G,) when nobody was by the stop line of each last."""
+        self._set_junction = network.link_junction[network.set_link]
+        set_veh, before_veh = rooms_veh(network)
+        self._room = set_veh, before_veh
+        self._dense = np.zeros(len(network.lane_sets))
+        """(L,) share of their room in sight that vehicles have taken up of late."""
+        self._looked_s = np.zeros(len(network.lane_sets))
+        """(L,) when that was looked at."""
+        self._empty_s = np.zeros(len(network.lane_sets))
+        """(L,) when nobody was by the stop line of each last."""
 
     def look(
         self,
@@ -55,36 +55,36 @@ class Worth:
         """(N,) what a vehicle of each stream is worth, (N,) how many leave in a bin of green.
 
         By the vehicles in `zones` (View.zone_veh) before the junctions `asked` (J,) and on all links `x` (Z,); the
-        `shares` of their links' traffic that streams (N,) and lane groups (G,) have; the `most` (N,) that can leave
-        of each stream, whether it is `stuck` (N,) before its green, and how much more lane groups (G,) weigh who hold
+        `shares` of their links' traffic that streams (N,) and lane sets (L,) have; the `most` (N,) that can leave
+        of each stream, whether it is `stuck` (N,) before its green, and how much more lane sets (L,) weigh who hold
         others up.
         """
         network, streams = self._network, self._streams
         _lasting(
-            time_s, asked, self._group_junction, network.group_link, *zones, *self._room,
+            time_s, asked, self._set_junction, network.set_link, *zones, *self._room,
             shares[1], self._dense, self._looked_s, self._empty_s,
         )  # fmt: skip
         worth, moving = _worth(
-            x, network.storage_veh, self._dense, network.begins_amid, streams.link, streams.group, streams.next_link,
-            shares[0], most, stuck, held, time_s, self._empty_s, *self._settings,
+            x, network.storage_veh, self._dense, network.begins_amid, streams.link, streams.lane_set, streams.group,
+            streams.next_link, shares[0], most, stuck, held, time_s, self._empty_s, *self._settings,
         )  # fmt: skip
         return worth, moving
 
 
 @compiled
 def _lasting(
-    time_s: float, asked: Bools, group_junction: Ints, group_link: Ints, zone: Floats, upstream: Floats, room: Floats,
+    time_s: float, asked: Bools, set_junction: Ints, set_link: Ints, zone: Floats, upstream: Floats, room: Floats,
     before: Floats, share: Floats, dense: Floats, looked_s: Floats, empty_s: Floats,
 ) -> None:  # fmt: skip
-    """Brings `dense` (G,) and `empty_s` (G,) up to date where somebody has looked."""
-    for group, link in enumerate(group_link):
-        if asked[group_junction[group]]:
-            veh = zone[group].sum() + share[group] * upstream[link].sum()
-            now = min(veh / max(room[group] + share[group] * before[link], 1.0), 1.0)
-            dense[group] += (1 - np.exp((looked_s[group] - time_s) / LASTING_S)) * (now - dense[group])
-            looked_s[group] = time_s
-            if zone[group, 0] < 1:
-                empty_s[group] = time_s
+    """Brings `dense` (L,) and `empty_s` (L,) up to date where somebody has looked."""
+    for lane_set, link in enumerate(set_link):
+        if asked[set_junction[lane_set]]:
+            veh = zone[lane_set].sum() + share[lane_set] * upstream[link].sum()
+            now = min(veh / max(room[lane_set] + share[lane_set] * before[link], 1.0), 1.0)
+            dense[lane_set] += (1 - np.exp((looked_s[lane_set] - time_s) / LASTING_S)) * (now - dense[lane_set])
+            looked_s[lane_set] = time_s
+            if zone[lane_set, 0] < 1:
+                empty_s[lane_set] = time_s
 
 
 @compiled
@@ -95,7 +95,7 @@ def _lasts(dense: Floats) -> Floats:
 
 @compiled
 def _worth(
-    x: Floats, storage: Floats, dense: Floats, amid: Bools, links: Ints, groups: Ints, next_links: Ints,
+    x: Floats, storage: Floats, dense: Floats, amid: Bools, links: Ints, sets: Ints, groups: Ints, next_links: Ints,
     of_link: Floats, most: Floats, stuck: Bools, held: Floats, time_s: float, empty_s: Floats, crowding: float,
     blocking: float, starving: float, full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
@@ -105,16 +105,16 @@ def _worth(
     for stream, ahead in enumerate(next_links):
         if ahead != EXIT:
             feeding[ahead] += of_link[stream]
-            behind[ahead] += of_link[stream] * queue[groups[stream]]
+            behind[ahead] += of_link[stream] * queue[sets[stream]]
     worth, moving = np.empty(len(links)), most.copy()
     for stream, ahead in enumerate(next_links):
         link = links[stream]
         there = taken[ahead] if ahead != EXIT else 0.0
         # A queue takes the room of those who would come onto its link, the more of them wait behind.
-        blocks = queue[groups[stream]] * behind[link] / feeding[link] if feeding[link] > 0 else 0.0
+        blocks = queue[sets[stream]] * behind[link] / feeding[link] if feeding[link] > 0 else 0.0
         value = max(1 + crowding * (taken[link] - there) + blocking * blocks, LEAST_WORTH)
         # With queues enough for the best stages there are others that would never be worth their clearance.
-        starved = min((time_s - empty_s[groups[stream]]) / STARVED_S, 1.0)
+        starved = min((time_s - empty_s[sets[stream]]) / STARVED_S, 1.0)
         worth[stream] = held[groups[stream]] * (1 + starving * starved) * value
         fed = (full + FADING / 2 - there) / FADING
         if fed < 1:

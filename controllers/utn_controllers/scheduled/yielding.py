@@ -25,48 +25,48 @@ LEAST_SHARE = 0.05
 
 
 class Yielding:
-    """Keeps which share of its discharge each lane group has in stages in which it gives way."""
+    """Keeps which share of its discharge each lane set has in stages in which it gives way."""
 
     def __init__(self, network: Network, streams: Streams, moves: Floats):
         """`moves` (R, most streams of a junction) of `Rules`, whose rows of stages are kept up to date."""
         self._network, self._streams, self._moves = network, streams, moves
-        self._gives_way = _give_way(network, streams)
-        """(S, G) lane groups that must give way in a stage, and not in another one."""
-        self._share = np.ones(self._gives_way.shape)
-        """(S, G) of the discharge."""
-        self._queued = np.zeros(len(network.groups), dtype=np.bool_)
-        """(G,) lane groups that had somebody by the stop line when they were last looked at."""
+        self.learnt = _give_way(network, streams)
+        """(S, L) lane sets that must give way in a stage, and not in another one."""
+        self._share = np.ones(self.learnt.shape)
+        """(S, L) of the discharge."""
+        self._queued = np.zeros(len(network.lane_sets), dtype=np.bool_)
+        """(L,) lane sets that had somebody by the stop line when they were last looked at."""
         self._looked_s = np.zeros(len(network.junctions))
         """(J,) when that was."""
-        self._left_veh = np.zeros(len(network.groups))
-        """(G,) who had left by then."""
-        self._is_needed = bool(self._gives_way.any())
+        self._left_veh = np.zeros(len(network.lane_sets))
+        """(L,) who had left by then."""
+        self._is_needed = bool(self.learnt.any())
 
     def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats) -> None:
         """Take up who has gone before the junctions `asked` (J,) in their `present` stage, the row (J,) that it is.
 
-        `zone` (G, zones) of View.zone_veh.
+        `zone` (L, zones) of View.zone_veh.
         """
         if self._is_needed:
             network, streams = self._network, self._streams
             _learn(
                 view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0],
-                network.group_saturation_flow_veh_s, network.link_junction[network.group_link], self._gives_way,
-                self._share, self._queued, self._looked_s, self._left_veh, streams.group, streams.first,
+                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self.learnt,
+                self._share, self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.first,
                 streams.first_stage, streams.serves, self._moves,
             )  # fmt: skip
 
 
 def _give_way(network: Network, streams: Streams) -> Bools:
-    """(S, G) lane groups of which somebody must give way in a stage, and nobody in another one of the junction's."""
-    gives_way = np.zeros((len(streams.stage), len(network.groups)), dtype=np.bool_)
+    """(S, L) lane sets of which somebody must give way in a stage, and nobody in another one of the junction's."""
+    gives_way = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=np.bool_)
     has_way = np.zeros_like(gives_way)
     for row, stage in enumerate(streams.stage):
         state = network.stages[stage].state
         for stream in np.flatnonzero(streams.serves[row]):
             letters = [state[letter] for letter in streams.letters[stream]]
-            (gives_way if GIVES_WAY in letters else has_way)[row, streams.group[stream]] = True
-    alone = np.zeros((len(network.junctions), len(network.groups)), dtype=np.bool_)
+            (gives_way if GIVES_WAY in letters else has_way)[row, streams.lane_set[stream]] = True
+    alone = np.zeros((len(network.junctions), len(network.lane_sets)), dtype=np.bool_)
     junction = network.stage_junction[streams.stage]
     np.logical_or.at(alone, junction, has_way & ~gives_way)
     return np.asarray(gives_way & alone[junction])
@@ -75,26 +75,26 @@ def _give_way(network: Network, streams: Streams) -> Bools:
 @compiled
 def _learn(
     time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, flow: Floats,
-    group_junction: Ints, gives_way: Bools, share: Floats, queued: Bools, looked_s: Floats, before: Floats,
-    stream_group: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
+    set_junction: Ints, gives_way: Bools, share: Floats, queued: Bools, looked_s: Floats, before: Floats,
+    stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
 ) -> None:  # fmt: skip
-    for group, junction in enumerate(group_junction):
+    for lane_set, junction in enumerate(set_junction):
         if not asked[junction]:
             continue
         row, since_s = present[junction], time_s - looked_s[junction]
         for stage in range(first_stage[junction], first_stage[junction + 1]):
-            share[stage, group] += min(since_s / FORGET_S, 1.0) * (1 - share[stage, group])
-        if gives_way[row, group] and queued[group] and looked_s[junction] >= begin_s[junction] + START_S:
-            gone = (left[group] - before[group]) / (flow[group] * since_s)
-            now = share[row, group] + min(since_s / MEMORY_S, 1.0) * (gone - share[row, group])
-            share[row, group] = min(max(now, LEAST_SHARE), 1.0)
-        queued[group] = near[group] >= 1
-        before[group] = left[group]
+            share[stage, lane_set] += min(since_s / FORGET_S, 1.0) * (1 - share[stage, lane_set])
+        if gives_way[row, lane_set] and queued[lane_set] and looked_s[junction] >= begin_s[junction] + START_S:
+            gone = (left[lane_set] - before[lane_set]) / (flow[lane_set] * since_s)
+            now = share[row, lane_set] + min(since_s / MEMORY_S, 1.0) * (gone - share[row, lane_set])
+            share[row, lane_set] = min(max(now, LEAST_SHARE), 1.0)
+        queued[lane_set] = near[lane_set] >= 1
+        before[lane_set] = left[lane_set]
     for junction in range(len(asked)):
         if not asked[junction]:
             continue
         looked_s[junction] = time_s
         for stage in range(first_stage[junction], first_stage[junction + 1]):
             for stream in range(first[junction], first[junction + 1]):
-                if serves[stage, stream] and gives_way[stage, stream_group[stream]]:
-                    moves[stage, stream - first[junction]] = share[stage, stream_group[stream]]
+                if serves[stage, stream] and gives_way[stage, stream_set[stream]]:
+                    moves[stage, stream - first[junction]] = share[stage, stream_set[stream]]

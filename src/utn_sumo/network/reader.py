@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import utn_network
-from utn_sumo.contract import EXIT, SAMPLE_S, Junction, LaneGroup, Link, Network, Stage, Turn
+from utn_sumo.contract import EXIT, SAMPLE_S, Junction, LaneGroup, LaneSet, Link, Network, Stage, Turn
 from utn_sumo.errors import NetworkError, did_you_mean
 from utn_sumo.network import programmes
+from utn_sumo.network.lanes import lane_groups, lane_sets
 from utn_sumo.network.programmes import MIN_GREEN_S, SHORT_GREEN_S, Block, Phase
-from utn_sumo.network.roads import Chain, Roads, for_motors, lane_groups, leads_on, motor_lanes, usual_weight
+from utn_sumo.network.roads import Chain, Roads, for_motors, leads_on, motor_lanes, usual_weight
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
 from utn_sumo.xml_files import opened, stem
@@ -176,7 +177,7 @@ class _Reader:
         self.link_from = {chain.edges[0]: index for index, chain in enumerate(self.chains)}
 
     def network(self, path: Path, name: str, left_alone: Mapping[str, str]) -> Network:
-        turns, groups = self._turns()
+        turns, groups, lanes_of = self._turns()
         fed = {turn.next_link for turn in turns}
         links = tuple(self._link(chain, index in fed) for index, chain in enumerate(self.chains))
         turn_index = {(turn.link, turn.to_edge): index for index, turn in enumerate(turns)}
@@ -207,6 +208,7 @@ class _Reader:
             links,
             tuple(turns),
             tuple(groups),
+            tuple(self._lane_sets(groups, turns, lanes_of, turn_index, stages)),
             tuple(stages),
             tuple(junctions),
             edge_lanes={edge: motor_lanes(self.net.getEdge(edge)) for edge in edges},
@@ -237,16 +239,18 @@ class _Reader:
             parting=chain.parting,
         )
 
-    def _turns(self) -> tuple[list[Turn], list[LaneGroup]]:
+    def _turns(self) -> tuple[list[Turn], list[LaneGroup], list[tuple[int, ...]]]:
+        """Turns, lane groups, and the lanes of each turn."""
         turns: list[Turn] = []
+        lanes_of: list[tuple[int, ...]] = []
         groups: list[LaneGroup] = []
         for index, edge_id in enumerate(self.approaches):
             outgoing = {edge: for_motors(each) for edge, each in self.net.getEdge(edge_id).getOutgoing().items()}
             targets = sorted((edge for edge, each in outgoing.items() if each), key=lambda edge: _natural(edge.getID()))
             shares = self._shares(edge_id, {edge.getID(): outgoing[edge] for edge in targets})
-            found = lane_groups(
-                (edge.getID(), [each.getFromLane().getIndex() for each in outgoing[edge]]) for edge in targets
-            )
+            lanes = [tuple(sorted({each.getFromLane().getIndex() for each in outgoing[edge]})) for edge in targets]
+            found = lane_groups(zip((edge.getID() for edge in targets), lanes, strict=True))
+            lanes_of += lanes
             group_of = {name: len(groups) + place for place, (_, names) in enumerate(found) for name in names}
             groups += [LaneGroup(index, lanes) for lanes, _ in found]
             turns += [
@@ -260,7 +264,37 @@ class _Reader:
                 )
                 for edge, share in zip(targets, shares, strict=True)
             ]
-        return turns, groups
+        return turns, groups, lanes_of
+
+    def _lane_sets(
+        self,
+        groups: Sequence[LaneGroup],
+        turns: Sequence[Turn],
+        lanes_of: Sequence[Sequence[int]],
+        turn_index: Mapping[tuple[int, str], int],
+        stages: Sequence[Stage],
+    ) -> list[LaneSet]:
+        """The lanes of each group, parted where somebody of it gives way."""
+        letters: dict[tuple[int, int], set[int]] = {}
+        for signal in self.signals:
+            for connection, letter in signal.connections:
+                link = self.link_of.get(connection.getFrom().getID(), -1)
+                turn = turn_index.get((link, connection.getTo().getID()))
+                if turn is not None:
+                    letters.setdefault((turn, connection.getFromLane().getIndex()), set()).add(letter)
+        ways: list[dict[int, dict[int, set[int]]]] = [{lane: {} for lane in group.lanes} for group in groups]
+        for index, (each, lanes) in enumerate(zip(turns, lanes_of, strict=True)):
+            for lane in lanes:
+                ways[each.group][lane][index] = letters.get((index, lane), set())
+        states: list[list[str]] = [[] for _ in self.signals]
+        for stage in stages:
+            states[stage.junction].append(stage.state)
+        shown = [states[self.junction_of[self.approaches[group.link]]] for group in groups]
+        return [
+            LaneSet(group, lanes, tuple(own), tuple(tuple(sorted(each)) for each in own.values()))
+            for group, (by_lane, of_junction) in enumerate(zip(ways, shown, strict=True))
+            for lanes, own in lane_sets(by_lane, of_junction)
+        ]
 
     def _shares(self, edge_id: str, connections: Mapping[str, list[Any]]) -> list[float]:
         """Turning fractions of an approach edge: as given, else by lanes, and by the traffic that will turn there.

@@ -103,19 +103,3 @@ def _main(sides: Mapping[Any, list[Any]]) -> Any | None:
         return straight, usual_weight(connections), edge.getPriority(), edge.getID()
 
     return max(able, key=rank)[0]
-
-
-def lane_groups(turns: Iterable[tuple[str, Iterable[int]]]) -> list[tuple[tuple[int, ...], tuple[str, ...]]]:
-    """Lanes that share turns, with those turns, from (turn, its lanes): in the order of the lanes."""
-    groups: list[tuple[set[int], set[str]]] = []
-    for turn, lanes in turns:
-        own, names = set(lanes), {turn}
-        apart = []
-        for other, others in groups:
-            if other & own:
-                own |= other
-                names |= others
-            else:
-                apart.append((other, others))
-        groups = [*apart, (own, names)]
-    return sorted((tuple(sorted(lanes)), tuple(sorted(names))) for lanes, names in groups)

@@ -24,28 +24,33 @@ class Eyes:
     def __init__(self, network: Network, ids: DetectorIds, sumo: Any):
         """`sumo` is libsumo."""
         self._groups = len(network.groups)
+        self._sets = len(network.lane_sets)
         self._links = len(network.links)
         self._group_link = network.group_link
         self._share = network.group_shares(network.fraction)
         """(G,) of a link's traffic what takes the lanes of each group."""
-        # Detectors of a lane group, then of a link before its lanes part.
-        junction = np.concatenate([network.link_junction[network.group_link], network.link_junction])
+        self._set_link = network.set_link
+        # Detectors of a lane group or set, then of a link before its lanes part.
+        by_group = np.concatenate([network.link_junction[network.group_link], network.link_junction])
+        by_set = np.concatenate([network.link_junction[network.set_link], network.link_junction])
         self._is_shared = any(ids.upstream)
         detectors = partial(_Detectors, junctions=len(network.junctions))
-        self._areas = detectors([*ids.group, *ids.upstream], junction)
+        self._areas = detectors([*ids.group, *ids.upstream], by_group)
         self._zones = detectors(
-            list(chain.from_iterable([*ids.group_zone, *ids.upstream_zone])), np.repeat(junction, len(ZONES_M))
+            list(chain.from_iterable([*ids.set_zone, *ids.upstream_zone])), np.repeat(by_set, len(ZONES_M))
         )
         self._entries = detectors(
             [(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)], network.link_junction
         )
         # Counted at the stop line: who changes lanes just there is missed now and then, but loops are half as many.
-        self._exits = detectors([*ids.group_stop_line, *ids.parting], junction)
+        self._exits = detectors([*ids.set_stop_line, *ids.parting], by_set)
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
         self._amid = ids.amid
-        self._group_close = [list(chain.from_iterable(zones[:CLOSE_ZONES])) for zones in ids.group_zone]
+        self._group_close: list[list[str]] = [[] for _ in network.groups]
+        for group, zones in zip(network.set_group, ids.set_zone, strict=True):
+            self._group_close[group] += chain.from_iterable(zones[:CLOSE_ZONES])
         self._step_s = network.control_step_s
         self._halting = bare(sumo, "lanearea", "getLastStepHaltingNumber")
         self._present = bare(sumo, "lanearea", "getLastStepVehicleNumber")
@@ -55,8 +60,8 @@ class Eyes:
         self._x_veh = np.zeros(self._links)
         """(Z,) vehicles on each link when the control step began."""
         self._entered_veh = np.zeros(self._links)
-        self._left_veh = np.zeros(self._groups)
-        """(Z,) vehicles that had come onto each link by then, (G,) that had crossed each lane group's stop line."""
+        self._left_veh = np.zeros(self._sets)
+        """(Z,) vehicles that had come onto each link by then, (L,) that had crossed each lane set's stop line."""
         self._warm_up()
 
     def begin(self, time_s: float, x_veh: Floats) -> None:
@@ -64,7 +69,7 @@ class Eyes:
         self._x_veh = np.array(x_veh, dtype=np.float64)
         if time_s > 0:
             self._entered_veh = self._entered_veh + self._entries.read(self._counted_last)
-            self._left_veh = self._left_veh + self._exits.read(self._counted_last)[: self._groups]
+            self._left_veh = self._left_veh + self._exits.read(self._counted_last)[: self._sets]
 
     def waiting_veh(self) -> Floats:
         """(G,) standing in the lane-area detectors."""
@@ -75,20 +80,20 @@ class Eyes:
         return self._by_group(self._areas.read(self._present))
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
-        """(G, zones) and (Z, zones) of contract.View."""
+        """(L, zones) and (Z, zones) of contract.View."""
         veh = self._zones.read(self._present, junctions).reshape(-1, len(ZONES_M))
-        return veh[: self._groups], veh[self._groups :]
+        return veh[: self._sets], veh[self._sets :]
 
     def counted_veh(self, time_s: float) -> tuple[Floats, Floats, Floats]:
         """What has been counted by now.
 
-        (Z,) vehicles on each link, (Z,) that have come onto it and (G,) left over stop lines since the run began.
+        (Z,) vehicles on each link, (Z,) that have come onto it and (L,) left over stop lines since the run began.
         """
         if time_s % self._step_s == 0:
             return np.maximum(self._x_veh, 0.0), self._entered_veh, self._left_veh
         came, left = self._entries.read(self._counted), self._exits.read(self._counted)
         counted: tuple[Floats, Floats, Floats] = _counted(
-            came, left, self._x_veh, self._entered_veh, self._left_veh, self._group_link
+            came, left, self._x_veh, self._entered_veh, self._left_veh, self._set_link
         )
         return counted
 
@@ -113,8 +118,8 @@ class Eyes:
     def _warm_up(self) -> None:
         """Have the machine code made now, not at the first decision."""
         self._entries.read(lambda _: 0)
-        left = np.zeros(self._groups + self._links)
-        _counted(self._x_veh, left, self._x_veh, self._entered_veh, self._left_veh, self._group_link)
+        left = np.zeros(self._sets + self._links)
+        _counted(self._x_veh, left, self._x_veh, self._entered_veh, self._left_veh, self._set_link)
 
     def _by_group(self, veh: Floats) -> Floats:
         """(G,) counts by lane group, of (G + Z,) with those before the lanes part, shared out as traffic is."""
@@ -167,13 +172,13 @@ def _added(seen: Floats, junction: Ints, asked: Bools, place: Ints, places: int)
 
 @compiled
 def _counted(
-    came: Floats, left: Floats, x: Floats, entered: Floats, over: Floats, group_link: Ints
+    came: Floats, left: Floats, x: Floats, entered: Floats, over: Floats, set_link: Ints
 ) -> tuple[Floats, Floats, Floats]:
-    """As Eyes.counted_veh, by who has `left` (G + Z,) over stop lines and amid links since the control step began."""
-    groups = len(over)
-    now, total = x + came - left[groups:], over + left[:groups]
-    for group, link in enumerate(group_link):
-        now[link] -= left[group]
+    """As Eyes.counted_veh, by who has `left` (L + Z,) over stop lines and amid links since the control step began."""
+    sets = len(over)
+    now, total = x + came - left[sets:], over + left[:sets]
+    for lane_set, link in enumerate(set_link):
+        now[link] -= left[lane_set]
     return np.maximum(now, 0.0), entered + came, total
 
 
@@ -212,7 +217,7 @@ class Sight:
 
     @property
     def left_veh(self) -> Floats:
-        """(G,) vehicles that have left over the stop line of each lane group since the run began."""
+        """(L,) vehicles that have left over the stop line of each lane set since the run began."""
         return self._counted_veh[2]
 
     @cached_property

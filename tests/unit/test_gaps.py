@@ -1,0 +1,88 @@
+"""Who gives way goes in the gaps of what comes towards him; lanes part where somebody does; loads are even."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.integration import odd_nets
+from utn_controllers.scheduled.execution import Scheduled
+from utn_controllers.scheduled.gaps import Gaps, let_go
+from utn_controllers.scheduled.streams import Streams
+from utn_sumo.clearances import GIVES_WAY
+from utn_sumo.contract import Network
+from utn_sumo.network.lanes import lane_sets
+
+Make = Callable[[Path], Any]
+StreetOf = Callable[[Make], Network]
+BINS = 12
+
+
+def queues(waiting: float, towards_veh: float, come_veh: float = 0.0) -> list[float]:
+    """What is left in each bin of a green of ten vehicles that give way to a queue and to who comes towards them."""
+    gaps = Gaps(np.array([[waiting, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.array([True]), 2.0)
+    veh, come = np.array([10.0, towards_veh]), np.zeros((2, BINS))
+    come[1] = come_veh
+    pace, want, left = np.ones(2), np.zeros(2), []
+    for bin_ in range(BINS):
+        let_go(0, bin_, veh, come, np.ones(2), np.ones((1, 2)), np.array([[0, 1, -1]]), gaps, pace, want)
+        left.append(float(veh[0]))
+    return left
+
+
+def test_with_nobody_towards_him_he_goes_as_if_he_had_way() -> None:
+    assert queues(1.0, 0.0) == pytest.approx(np.maximum(10.0 - np.arange(1, BINS + 1), 0.0))
+
+
+def test_hardly_anybody_goes_until_the_queue_towards_him_has() -> None:
+    left = -np.diff([10.0, *queues(1.0, 6.0)])
+    assert (left[:6] < 0.2).all()
+    assert (left[6:] > 0.9).all()
+
+
+@given(come=st.floats(0.0, 1.0), more=st.floats(0.01, 0.5), share=st.floats(0.1, 0.9))
+def test_the_more_come_towards_him_the_fewer_go_and_the_more_of_a_lane_waits(
+    come: float, more: float, share: float
+) -> None:
+    assert queues(1.0, 0.0, come)[-1] <= queues(1.0, 0.0, come + more)[-1]
+    assert queues(share, 0.0, come)[-1] <= queues(1.0, 0.0, come)[-1] + 1e-9
+
+
+def test_left_turns_without_a_stage_of_their_own_wait_for_who_comes_straight_on(street_of: StreetOf) -> None:
+    network = street_of(odd_nets.plain)
+    execution = Scheduled(network)
+    gaps, streams = execution._giving.gaps, execution._streams
+    for row, stage in enumerate(streams.stage):
+        shown = network.stages[stage]
+        first = streams.first[shown.junction]
+        for stream in np.flatnonzero(streams.serves[row]):
+            of_set = np.flatnonzero(streams.serves[row] & (streams.lane_set == streams.lane_set[stream]))
+            gives = any(shown.state[letter] == GIVES_WAY for each in of_set for letter in streams.letters[each])
+            if gaps.waiting[row, stream - first] > 0:
+                assert gives
+                foes = gaps.foes[row, stream - first]
+                assert all(streams.link[first + foe] != streams.link[stream] for foe in foes[foes >= 0])
+    assert gaps.some.any()
+
+
+def test_lanes_part_where_somebody_gives_way_and_else_not() -> None:
+    ways = {0: {7: {0}, 8: {1}}, 1: {8: {2}}, 2: {8: {3}, 9: {4}}}
+    assert lane_sets(ways, ["GGGGG", "rrrrr"]) == [((0, 1, 2), {7: {0}, 8: {1, 2, 3}, 9: {4}})]
+    assert [lanes for lanes, _ in lane_sets(ways, ["GGGGg", "rrrrr"])] == [(0,), (1,), (2,)]
+    alike = {0: {8: {0}}, 1: {8: {1}}, 2: {8: {2}, 9: {3}}}
+    assert [lanes for lanes, _ in lane_sets(alike, ["GGGg", "rrrr"])] == [(0, 1), (2,)]
+
+
+def test_who_has_a_choice_of_lanes_takes_the_emptier_ones(street_of: StreetOf) -> None:
+    network = street_of(odd_nets.plain)
+    streams = Streams(network)
+    shares = streams.shares(network.fraction)
+    by_link = np.bincount(network.set_link, shares.set_of_link, len(network.links))
+    assert by_link == pytest.approx(1.0)
+    assert np.bincount(streams.lane_set, shares.of_set)[np.unique(streams.lane_set)] == pytest.approx(1.0)
