@@ -460,7 +460,8 @@ class Network:
         links = np.concatenate([self.links_of[junction] for junction in junctions]).tolist()
         groups = np.concatenate([self.groups_of[junction] for junction in junctions]).tolist()
         turns = np.concatenate([self.turns_of[junction] for junction in junctions]).tolist()
-        lane_sets = [lane_set for group in groups for lane_set in self.lane_sets if lane_set.group == group]
+        bounds = np.searchsorted(self.set_group, [groups, np.add(groups, 1)]).T
+        lane_sets = [lane_set for begin, end in bounds for lane_set in self.lane_sets[begin:end]]
         stages = [stage for junction in junctions for stage in self.junctions[junction].stages]
         link_place, turn_place, group_place, stage_place, junction_place = (
             {whole: position for position, whole in enumerate(each)}

@@ -44,8 +44,12 @@ class Giving:
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
         """(S, V) signalled ways that wait for gaps in a stage."""
         foes: dict[tuple[int, int], set[int]] = {}
+        self._first_way = np.searchsorted(streams.way_stream, streams.first)
+        """(J + 1,) where the junctions' ways begin."""
         for row, stage in enumerate(streams.stage):
-            for way, stream in enumerate(streams.way_stream):
+            junction = network.stage_junction[stage]
+            for way in range(*self._first_way[junction : junction + 2]):
+                stream = streams.way_stream[way]
                 if streams.serves[row, stream] and not learnt[row, streams.lane_set[stream]]:
                     own = _foes(network, streams, row, int(stage), way)
                     self._waits[row, way] = len(own) > 0
@@ -56,8 +60,8 @@ class Giving:
             np.zeros(shape), np.full((*shape, most + 1), -1), np.zeros(shape[0], dtype=np.bool_), GAP_S / bin_s
         )
         for row, stage in enumerate(streams.stage):
-            first = streams.first[network.stage_junction[stage]]
-            for stream in np.flatnonzero(streams.serves[row]):
+            first, last = streams.first[network.stage_junction[stage] :][:2]
+            for stream in first + np.flatnonzero(streams.serves[row, first:last]):
                 found = sorted(foes.get((row, int(streams.lane_set[stream])), ()))
                 self.gaps.foes[row, stream - first, : len(found)] = np.array(found, dtype=np.int64) - first
 
@@ -65,11 +69,10 @@ class Giving:
         """Go by these shares (V,) that signalled ways have of their lane sets' traffic from now on."""
         streams = self._streams
         for junction, (first, last) in enumerate(zip(streams.first[:-1], streams.first[1:], strict=True)):
+            ways = slice(*self._first_way[junction : junction + 2])
+            alike = streams.lane_set[first:last, None] == streams.lane_set[streams.way_stream[ways]]
             for row in range(*streams.first_stage[junction : junction + 2]):
-                share = np.bincount(
-                    streams.lane_set[streams.way_stream], of_set * self._waits[row], streams.lane_set.max() + 1
-                )
-                own = share[streams.lane_set[first:last]] * streams.serves[row, first:last]
+                own = alike @ (of_set[ways] * self._waits[row, ways]) * streams.serves[row, first:last]
                 self.gaps.waiting[row, : last - first] = own
                 self.gaps.some[row] = (own > 0).any()
 

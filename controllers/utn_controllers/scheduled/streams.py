@@ -49,11 +49,7 @@ class Streams:
         self._way_set = np.array([lane_set for lane_set, _, _ in ways], dtype=np.int64)
         self._way_turn = np.array([turn for _, turn, _ in ways], dtype=np.int64)
         """(W,) lane set and turn of each way from the one to the other."""
-        by_turn: dict[int, list[int]] = {}
-        for way, (_, turn, _) in enumerate(ways):
-            by_turn.setdefault(turn, []).append(way)
-        choices = [pair for each in by_turn.values() for pair in combinations(each, 2)]
-        self._choices = np.array(choices, dtype=np.int64).reshape(-1, 2)
+        self._choices = _choices(self._way_turn)
         """(C, 2) ways between which a turn has the choice."""
         junction = network.link_junction[network.set_link[self._way_set]]
         signalled = np.flatnonzero([len(letters) > 0 for _, _, letters in ways])
@@ -65,7 +61,8 @@ class Streams:
         of_way = []
         for way in self._signalled:
             lane_set, turn, letters = ways[way]
-            serves = _serves(network, self.stage, int(junction[way]), letters)
+            own_rows = range(*self.first_stage[junction[way] : junction[way] + 2])
+            serves = _serves(network, self.stage, own_rows, letters)
             stream = place.setdefault((lane_set, int(network.turn_next[turn]), serves.tobytes()), len(place))
             if stream == len(own):
                 own.append(set())
@@ -104,12 +101,22 @@ class Streams:
         return Shares(of_link, of_link / least[self.lane_set], way_of_set, load)
 
 
-def _serves(network: Network, stages: Ints, junction: int, letters: tuple[int, ...]) -> Bools:
-    """(S,) stages of a junction that show one of these letters green."""
-    shown = [network.stages[stage] for stage in stages]
-    return np.array(
-        [stage.junction == junction and any(stage.state[letter] in GREEN for letter in letters) for stage in shown]
-    )
+def _choices(way_turn: Ints) -> Ints:
+    """(C, 2) pairs of ways of one turn, by the turns (W,) of all."""
+    by_turn: dict[int, list[int]] = {}
+    for way, turn in enumerate(way_turn.tolist()):
+        by_turn.setdefault(turn, []).append(way)
+    pairs = [pair for each in by_turn.values() for pair in combinations(each, 2)]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _serves(network: Network, stages: Ints, rows: range, letters: tuple[int, ...]) -> Bools:
+    """(S,) stages, of those of a junction in its `rows`, that show one of these letters green."""
+    serves = np.zeros(len(stages), dtype=np.bool_)
+    for row in rows:
+        state = network.stages[stages[row]].state
+        serves[row] = any(state[letter] in GREEN for letter in letters)
+    return serves
 
 
 @compiled
