@@ -51,33 +51,43 @@ def schedules(
         while rules.stages[low + present] != stage[junction]:
             present += 1
         stages = rules.first_stage[junction + 1] - low
-        chosen = _schedule(
-            present, rest[junction], low, stages, rules, stand[a:b], come[a:b], worth[a:b], ends[a:b], most[a:b],
-            plan[junction], sent[a:b],
-        )  # fmt: skip
+        if rules.gaps.some[low : low + stages].any():
+            chosen = _schedule(
+                present, rest[junction], low, stages, rules, rules.gaps, stand[a:b], come[a:b], worth[a:b], ends[a:b],
+                most[a:b], plan[junction], sent[a:b],
+            )  # fmt: skip
+        else:
+            chosen = _schedule(
+                present, rest[junction], low, stages, rules, None, stand[a:b], come[a:b], worth[a:b], ends[a:b],
+                most[a:b], plan[junction], sent[a:b],
+            )  # fmt: skip
         wish[junction] = rules.stages[low + chosen]
     return wish
 
 
 @compiled
 def _schedule(
-    present: int, rest: int, low: int, stages: int, rules: Rules, stand: Floats, come: Floats, worth: Floats,
-    ends: Floats, most: Floats, plan: Ints, sent: Floats,
+    present: int, rest: int, low: int, stages: int, rules: Rules, gaps: Gaps | None, stand: Floats, come: Floats,
+    worth: Floats, ends: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> int:  # fmt: skip
-    """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on."""
+    """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on.
+
+    `gaps` None says that nobody waits for any: the machine code for that is another, and quicker.
+    """
     chosen = present
     called = _called(present, low, stages, rules, stand, come)
     if called.any():
         traffic = _sums(rules.moves[low : low + stages], stand, come, worth, ends, most)
         # What was best a bin ago is seldom far from what is best now.
-        known = _waited(plan, rules, traffic)
+        _send_off(plan, rules, gaps, stand, come, most, sent)
+        known = _waited(sent, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
-            chosen = _search(present, rest, low, called, rules, traffic, limit, plan)
+            chosen = _search(present, rest, low, called, rules, gaps, traffic, limit, plan)
             if chosen >= 0:
                 break
     else:
         plan[:] = low + present
-    _send_off(plan, rules, stand, come, most, sent)
+    _send_off(plan, rules, gaps, stand, come, most, sent)
     return chosen
 
 
@@ -101,8 +111,9 @@ def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, co
 
 @compiled
 def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for the compiler
-    present: int, rest: int, low: int, called: Bools, rules: Rules, traffic: Traffic, limit: float, plan: Ints
-) -> int:
+    present: int, rest: int, low: int, called: Bools, rules: Rules, gaps: Gaps | None, traffic: Traffic, limit: float,
+    plan: Ints,
+) -> int:  # fmt: skip
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
     ends = traffic.ends
@@ -119,7 +130,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
     after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     others, veh = np.empty(stages, np.int64), np.empty(streams)
-    gaps, pace, want = rules.gaps, np.ones(streams), np.zeros(streams)
+    pace, want = np.ones(streams), np.zeros(streams)
     for begin in range(bins):
         for stage in range(stages):
             spent = cost[begin, stage]
@@ -187,16 +198,16 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 spent += _held(stage, grown, paid, now, now + 1, held)
                 held += grown[stage, now + 1] - grown[stage, now]
                 moving = 0.0
-                if gaps.some[row]:
-                    let_go(row, now, veh, come, most, moves, going, gaps, pace, want)
-                    for place in range(greens):
-                        moving += worth[going[row, place]] * veh[going[row, place]]
-                else:
+                if gaps is None:
                     for place in range(greens):
                         stream = going[row, place]
                         leaves = moves[row, stream] * most[stream]
                         veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
                         moving += worth[stream] * veh[stream]
+                else:
+                    let_go(row, now, veh, come, most, moves, going, gaps, pace, want)
+                    for place in range(greens):
+                        moving += worth[going[row, place]] * veh[going[row, place]]
                 now += 1
                 spent += moving
             if now == bins:
@@ -304,25 +315,26 @@ def _won(
 @compiled
 def _lead(
     before: int, end: int, begin: int, row: int, clearing: int, moves: Floats, going: Ints, come: Floats,
-    came: Floats, most: Floats, was: Floats, veh: Floats, gaps: Gaps, pace: Floats, want: Floats,
+    came: Floats, most: Floats, was: Floats, veh: Floats, gaps: Gaps | None, pace: Floats, want: Floats,
 ) -> None:  # fmt: skip
     """Fills in the queues `veh` when a stage begins, by those that there were when the stage `before` it did."""
     for stream in range(len(veh)):
         veh[stream] = was[stream] + came[stream, begin] - came[stream, before]
     place = 0
     while going[row, place] >= 0:
-        veh[going[row, place]] = was[going[row, place]]
+        stream = going[row, place]
+        veh[stream] = was[stream]
+        if gaps is None:
+            for now in range(before, end):
+                veh[stream] = max(veh[stream] + come[stream, now] - moves[row, stream] * most[stream], 0.0)
         place += 1
-    if gaps.some[row]:
+    if gaps is not None:
         pace[:] = 1.0
         for now in range(before, end):
             let_go(row, now, veh, come, most, moves, going, gaps, pace, want)
     place = 0
     while going[row, place] >= 0:
         stream = going[row, place]
-        if not gaps.some[row]:
-            for now in range(before, end):
-                veh[stream] = max(veh[stream] + come[stream, now] - moves[row, stream] * most[stream], 0.0)
         veh[stream] += came[stream, begin] - came[stream, end]
         place += 1
     place = 0
@@ -336,34 +348,16 @@ def _lead(
 
 
 @compiled
-def _waited(plan: Ints, rules: Rules, traffic: Traffic) -> float:
-    """What is waited by a `plan`."""
-    total, veh = 0.0, traffic.stand.copy()
-    pace, want = np.ones(len(veh)), np.zeros(len(veh))
-    for place in range(len(plan)):
-        _follow(plan, place, rules, veh, traffic.come, traffic.most, pace, want)
-        for stream in range(len(veh)):
-            total += traffic.worth[stream] * veh[stream]
-    for stream in range(len(veh)):
-        total += traffic.ends[stream] * veh[stream]
+def _waited(sent: Floats, traffic: Traffic) -> float:
+    """What is waited where so much is `sent` off (n, K)."""
+    total = 0.0
+    for stream in range(len(sent)):
+        veh, waited = traffic.stand[stream], 0.0
+        for place in range(sent.shape[1]):
+            veh += traffic.come[stream, place] - sent[stream, place]
+            waited += veh
+        total += traffic.worth[stream] * waited + traffic.ends[stream] * veh
     return total
-
-
-@compiled
-def _follow(
-    plan: Ints, place: int, rules: Rules, veh: Floats, come: Floats, most: Floats, pace: Floats, want: Floats
-) -> None:
-    """Brings the vehicles `veh` (n,) up to the end of one bin of a `plan`."""
-    row, stages = plan[place], len(rules.gaps.some)
-    if place == 0 or plan[place - 1] != row:
-        pace[:] = 1.0
-    some_wait = 0 <= row < stages and rules.gaps.some[row]
-    for stream in range(len(veh)):
-        share = rules.moves[row, stream] if row >= 0 else 0.0
-        if not (some_wait and share > 0):
-            veh[stream] = max(veh[stream] + come[stream, place] - share * most[stream], 0.0)
-    if some_wait:
-        let_go(row, place, veh, come, most, rules.moves, rules.going, rules.gaps, pace, want)
 
 
 @compiled
@@ -384,13 +378,37 @@ def _trace(present: int, begin: int, stage: int, low: int, whence: Ints, clearin
 
 
 @compiled
-def _send_off(plan: Ints, rules: Rules, stand: Floats, come: Floats, most: Floats, sent: Floats) -> None:
-    """Fills `sent` with what leaves by a `plan`."""
-    veh = stand.copy()
+def _send_off(
+    plan: Ints, rules: Rules, gaps: Gaps | None, stand: Floats, come: Floats, most: Floats, sent: Floats
+) -> None:
+    """Fills `sent` (n, K) with what leaves by a `plan`."""
+    if gaps is None:
+        for stream in range(len(stand)):
+            queue = stand[stream]
+            for place, row in enumerate(plan):
+                queue += come[stream, place]
+                leaves = min(queue, rules.moves[row, stream] * most[stream]) if row >= 0 else 0.0
+                sent[stream, place] = leaves
+                queue -= leaves
+    else:
+        _let_all_go(plan, rules, gaps, stand.copy(), come, most, sent)
+
+
+@compiled
+def _let_all_go(plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats, most: Floats, sent: Floats) -> None:
+    """Fills `sent` (n, K) as `_send_off` where somebody waits for gaps: bin by bin, from the vehicles `veh` (n,) on."""
     pace, want = np.ones(len(veh)), np.zeros(len(veh))
-    for place in range(len(plan)):
+    for place, row in enumerate(plan):
+        if place == 0 or plan[place - 1] != row:
+            pace[:] = 1.0
+        green = 0 <= row < len(gaps.some)
         for stream in range(len(veh)):
-            sent[stream, place] = veh[stream] + come[stream, place]
-        _follow(plan, place, rules, veh, come, most, pace, want)
+            share = rules.moves[row, stream] if row >= 0 else 0.0
+            there = veh[stream] + come[stream, place]
+            sent[stream, place] = there
+            if not (green and share > 0):
+                veh[stream] = max(there - share * most[stream], 0.0)
+        if green:
+            let_go(row, place, veh, come, most, rules.moves, rules.going, gaps, pace, want)
         for stream in range(len(veh)):
             sent[stream, place] -= veh[stream]
