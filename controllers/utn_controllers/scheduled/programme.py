@@ -5,7 +5,8 @@ it, one goes on, with the queues that it leaves: that on which less would have b
 stayed until then. What has been waited so far would be in favour of ways that have left somebody out. From there the
 stage may last until any later bin. Of those who have red nobody leaves, so that what they wait is a difference of sums
 made once; bin by bin go only those who have green, in a stage or for a while in a clearance. A way is left on which
-more has been waited than on another to its end, at first than by the schedule of the bin before.
+more has been waited, or will be in the next clearance, than on another to its end, at first than by the schedule of the
+bin before; and a stage to which nobody comes any more ends at once, or not until somebody does.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from utn_controllers.scheduled.gaps import Gaps, let_go
 from utn_controllers.scheduled.moves import Rules
 from utn_controllers.scheduled.traffic import Traffic
-from utn_sumo.compiling import compiled
+from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import Bools, Floats, Ints
 
 NEVER = 1e18
@@ -116,7 +117,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
 ) -> int:  # fmt: skip
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
-    ends = traffic.ends
+    ends, due = traffic.ends, traffic.due
     moves, going, clearing, clearance = rules.moves, rules.going, rules.clearing, rules.clearance
     came, least = traffic.came, rules.least
     (streams, bins), stages = come.shape, len(called)
@@ -131,40 +132,45 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     others, veh = np.empty(stages, np.int64), np.empty(streams)
     pace, want = np.ones(streams), np.zeros(streams)
+    stood, left, still, then = np.empty((4, stages + 1))
     for begin in range(bins):
         for stage in range(stages):
             spent = cost[begin, stage]
             if spent >= best - ALIKE:
                 continue
             row = low + stage
-            if begin > 0:
-                before, was, end = whence[begin, stage, 0], whence[begin, stage, 1], whence[begin, stage, 2]
-                _lead(
-                    before, end, begin, low + was, clearing[low + was, stage], moves, going, come, came, most,
-                    queue[before, was], queue[begin, stage], gaps, pace, want,
-                )  # fmt: skip
             # What the queues weigh that move, and that have red: these in `veh` as they stood when it began.
-            moving, held = 0.0, 0.0
-            for stream in range(streams):
-                veh[stream] = queue[begin, stage, stream]
-                held += worth[stream] * veh[stream]
-            greens = 0
+            moving, held, greens = 0.0, 0.0, 0
+            veh[:] = queue[begin, stage]
             while going[row, greens] >= 0:
-                stream = going[row, greens]
-                moving += worth[stream] * veh[stream]
+                moving += worth[going[row, greens]] * veh[going[row, greens]]
                 greens += 1
-            held -= moving
-            nexts = 0
+            _stood(row, begin, low, veh, moves, came, worth, ends, stood, left)
+            held = stood[stages] + grown[stage, begin]
+            nexts, lose = 0, bins
             for other in range(stages):
                 if after[stage, other]:
                     others[nexts], nexts = other, nexts + 1
+                    lose = 0 if clearing[row, other] >= 0 else min(lose, clearance[row, other])
             may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
-            now = begin
+            now, goes = begin, True
             pace[:] = 1.0
-            while now < bins and spent < best - ALIKE:
-                if now >= may_end:
+            while now < bins:
+                if spent + _held(stage, grown, paid, now, min(now + lose, bins), held) >= best - ALIKE:
+                    break
+                # Where nobody has gone in the bin before it could as well have ended then.
+                if now >= may_end and (goes or now == may_end):
                     # It ends here: others begin after their clearance, where that is the best way there.
                     won, won_in = 0.0, -1
+                    # As `stood` and `left`, with those who had green.
+                    still[:], then[:] = stood, left
+                    for place in range(greens):
+                        stream = going[row, place]
+                        before = veh[stream] - came[stream, now]
+                        for other in range(stages + 1):
+                            if other == stages or moves[low + other, stream] == 0:
+                                still[other] += worth[stream] * before
+                                then[other] += ends[stream] * before
                     for place in range(nexts):
                         other = others[place]
                         opens = min(now + clearance[row, other], bins)
@@ -172,7 +178,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                             continue
                         until = spent + _held(stages, grown, paid, now, opens, held + moving)
                         if opens == bins:
-                            until += _left(row, begin, now, veh, moves, came, ends)
+                            until += then[stages] + due[stages, bins]
                         if clearing[row, other] >= 0:
                             if clearing[row, other] != won_in:
                                 won_in = clearing[row, other]
@@ -180,24 +186,35 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                                     won_in, begin, row, now, opens, veh, moves, going, come, came, worth, ends, most
                                 )  # fmt: skip
                             until -= won
-                        if until >= rank[opens, other] - ALIKE:
+                        if until >= min(rank[opens, other], best) - ALIKE:
                             continue
                         behind = 0.0
                         if opens < bins:
-                            behind = _behind(
-                                low + other, row, clearing[row, other], begin, now, opens, veh, moves, come, came,
-                                worth, ends, most,
-                            )  # fmt: skip
+                            rest_bins = bins - opens
+                            behind = rest_bins * (grown[other, opens] + still[other])
+                            behind += due[other, opens] + then[other]
+                            if clearing[row, other] >= 0:
+                                behind -= _gone(
+                                    clearing[row, other], begin, row, now, opens, low + other, veh, moves, going,
+                                    come, came, worth, ends, most,
+                                )  # fmt: skip
                         if until + behind < rank[opens, other] - ALIKE:
                             cost[opens, other], rank[opens, other] = until, until + behind
                             whence[opens, other, 0] = begin
                             whence[opens, other, 1] = stage
                             whence[opens, other, 2] = now
-                    if now >= must_end:
-                        break
+                            if opens < bins:
+                                _lead(
+                                    begin, now, opens, row, clearing[row, other], moves, going, come, came, most, veh,
+                                    queue[opens, other],
+                                )  # fmt: skip
+                if now >= must_end:
+                    break
                 spent += _held(stage, grown, paid, now, now + 1, held)
                 held += grown[stage, now + 1] - grown[stage, now]
-                moving = 0.0
+                moving, goes = 0.0, False
+                for place in range(greens):
+                    goes |= veh[going[row, place]] + come[going[row, place], now] >= SOME_VEH
                 if gaps is None:
                     for place in range(greens):
                         stream = going[row, place]
@@ -211,9 +228,12 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 now += 1
                 spent += moving
             if now == bins:
-                spent += _left(row, begin, now, veh, moves, came, ends)
-            if now == bins and spent < best - ALIKE:
-                best, last_begin, last_stage = spent, begin, stage
+                spent += left[stages] + due[stages, bins]
+                for place in range(greens):
+                    stream = going[row, place]
+                    spent += ends[stream] * (veh[stream] - came[stream, bins])
+                if spent < best - ALIKE:
+                    best, last_begin, last_stage = spent, begin, stage
     for stage in range(stages):
         # Ways that end amid a clearance.
         if cost[bins, stage] < best - ALIKE:
@@ -228,67 +248,70 @@ def _sums(
     """The traffic with what the costs of red are made of."""
     stages, (streams, bins) = len(serves), come.shape
     came = np.zeros((streams, bins + 1))
-    grown, paid = np.zeros((stages + 1, bins + 1)), np.zeros((stages + 1, bins + 1))
+    grown, paid, due = np.zeros((3, stages + 1, bins + 1))
     for stream in range(streams):
         for place in range(bins):
             came[stream, place + 1] = came[stream, place] + come[stream, place]
         for stage in range(stages + 1):
             if stage == stages or serves[stage, stream] == 0:
-                for place in range(bins):
-                    grown[stage, place + 1] += worth[stream] * came[stream, place + 1]
+                for place in range(1, bins + 1):
+                    grown[stage, place] += worth[stream] * came[stream, place]
+                    due[stage, place] += ends[stream] * came[stream, place]
     for stage in range(stages + 1):
         for place in range(bins):
             paid[stage, place + 1] = paid[stage, place] + grown[stage, place + 1]
-    return Traffic(stand, come, came, grown, paid, worth, ends, most)
+    return Traffic(stand, come, came, grown, paid, due, worth, ends, most)
 
 
-@compiled
+@inlined
 def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weight: float) -> float:
     """What those wait in some bins who have red in a stage, and of whom so much stood before."""
     return float(paid[stage, until] - paid[stage, since] + (until - since) * (weight - grown[stage, since]))
 
 
-@compiled
-def _left(
-    row: int, begin: int, now: int, veh: Floats, moves: Floats, came: Floats, ends: Floats
-) -> float:  # fmt: skip
-    """What those weigh who are left at the end if nobody goes from `now` on; `veh` of who had red, as at its `begin`.
+@inlined
+def _stood(
+    row: int, begin: int, low: int, veh: Floats, moves: Floats, came: Floats, worth: Floats, ends: Floats,
+    stood: Floats, left: Floats,
+) -> None:  # fmt: skip
+    """What those weigh, in a bin and if `left`, who have red in the stage of a `row` and in each (s + 1), last in none.
 
-    Of who has green in the stage, it is as it is now.
+    By the vehicles `veh` (n,) as it begins, less those who have come by then: with the sums of `Traffic` up to a bin
+    it is what they weigh in that.
     """
-    total = 0.0
+    stages = len(stood) - 1
+    stood[:], left[:] = 0.0, 0.0
     for stream in range(len(veh)):
-        since = begin if moves[row, stream] == 0 else now
-        total += ends[stream] * (veh[stream] + came[stream, came.shape[1] - 1] - came[stream, since])
-    return total
+        if moves[row, stream] == 0:
+            before = veh[stream] - came[stream, begin]
+            for stage in range(stages + 1):
+                if stage == stages or moves[low + stage, stream] == 0:
+                    stood[stage] += worth[stream] * before
+                    left[stage] += ends[stream] * before
 
 
-@compiled
-def _behind(
-    other: int, row: int, clearing: int, begin: int, now: int, opens: int, veh: Floats, moves: Floats, come: Floats,
-    came: Floats, worth: Floats, ends: Floats, most: Floats,
+@inlined
+def _gone(
+    clearing: int, begin: int, row: int, end: int, opens: int, other: int, veh: Floats, moves: Floats, going: Ints,
+    come: Floats, came: Floats, worth: Floats, ends: Floats, most: Floats,
 ) -> float:  # fmt: skip
-    """What those cost until the end who are there when a stage opens that does not serve them; `veh` as in `_left`.
-
-    By rows of the `other` stage, of that which ends `now`, and of the clearance between them, -1 if all is red in it.
-    """
-    total, rest = 0.0, come.shape[1] - opens
-    for stream in range(len(veh)):
+    """What those would cost until the end who go in a clearance, and whom the stage after it does not serve."""
+    total, rest_bins, place = 0.0, come.shape[1] - opens, 0
+    while going[clearing, place] >= 0:
+        stream = going[clearing, place]
         if moves[other, stream] == 0:
             queue = veh[stream]
             if moves[row, stream] == 0:
-                queue += came[stream, now] - came[stream, begin]
-            if clearing < 0:
-                queue += came[stream, opens] - came[stream, now]
-            else:
-                for place in range(now, opens):
-                    leaves = moves[clearing + place - now, stream] * most[stream]
-                    queue = max(queue + come[stream, place] - leaves, 0.0)
-            total += (rest * worth[stream] + ends[stream]) * queue
+                queue += came[stream, end] - came[stream, begin]
+            red = queue + came[stream, opens] - came[stream, end]
+            for now in range(end, opens):
+                queue = max(queue + come[stream, now] - moves[clearing + now - end, stream] * most[stream], 0.0)
+            total += (rest_bins * worth[stream] + ends[stream]) * (red - queue)
+        place += 1
     return total
 
 
-@compiled
+@inlined
 def _won(
     clearing: int, begin: int, row: int, end: int, until: int, veh: Floats, moves: Floats, going: Ints, come: Floats,
     came: Floats, worth: Floats, ends: Floats, most: Floats,
@@ -312,38 +335,26 @@ def _won(
     return won
 
 
-@compiled
+@inlined
 def _lead(
-    before: int, end: int, begin: int, row: int, clearing: int, moves: Floats, going: Ints, come: Floats,
-    came: Floats, most: Floats, was: Floats, veh: Floats, gaps: Gaps | None, pace: Floats, want: Floats,
+    begin: int, end: int, opens: int, row: int, clearing: int, moves: Floats, going: Ints, come: Floats,
+    came: Floats, most: Floats, veh: Floats, queue: Floats,
 ) -> None:  # fmt: skip
-    """Fills in the queues `veh` when a stage begins, by those that there were when the stage `before` it did."""
+    """Fills in the `queue` (n,) when the next stage opens, by `veh` when one ends, of who had red as at its begin."""
     for stream in range(len(veh)):
-        veh[stream] = was[stream] + came[stream, begin] - came[stream, before]
+        queue[stream] = veh[stream] + came[stream, opens] - came[stream, begin]
     place = 0
     while going[row, place] >= 0:
         stream = going[row, place]
-        veh[stream] = was[stream]
-        if gaps is None:
-            for now in range(before, end):
-                veh[stream] = max(veh[stream] + come[stream, now] - moves[row, stream] * most[stream], 0.0)
-        place += 1
-    if gaps is not None:
-        pace[:] = 1.0
-        for now in range(before, end):
-            let_go(row, now, veh, come, most, moves, going, gaps, pace, want)
-    place = 0
-    while going[row, place] >= 0:
-        stream = going[row, place]
-        veh[stream] += came[stream, begin] - came[stream, end]
+        queue[stream] = veh[stream] + came[stream, opens] - came[stream, end]
         place += 1
     place = 0
     while clearing >= 0 and going[clearing, place] >= 0:
         stream = going[clearing, place]
-        veh[stream] -= came[stream, begin] - came[stream, end]
-        for now in range(end, begin):
+        queue[stream] -= came[stream, opens] - came[stream, end]
+        for now in range(end, opens):
             leaves = moves[clearing + now - end, stream] * most[stream]
-            veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
+            queue[stream] = max(queue[stream] + come[stream, now] - leaves, 0.0)
         place += 1
 
 

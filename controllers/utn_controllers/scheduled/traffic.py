@@ -20,6 +20,8 @@ class Traffic(NamedTuple):
     """(s + 1, K + 1) sum of what those weigh who have come and have red in a stage; in the last row, of all."""
     paid: Floats
     """(s + 1, K + 1) sum of what they have waited, if nobody had stood before."""
+    due: Floats
+    """(s + 1, K + 1) sum of what those weigh who have come and have red in a stage, and are left at the end."""
     worth: Floats
     """(n,) weight of a vehicle in a bin."""
     ends: Floats
