@@ -15,7 +15,7 @@ from tests.unit.views import by_the_line, scene
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.moves import Moves
 from utn_controllers.scheduled.streams import Streams
-from utn_controllers.scheduled.yielding import LEAST_SHARE, Yielding
+from utn_controllers.scheduled.yielding import BLOCKED_S, LEAST_SHARE, Yielding
 from utn_sumo.contract import Floats, Network
 
 Make = Callable[[Path], Any]
@@ -38,6 +38,18 @@ def through_stage(network: Network, group: int) -> int:
 
 def turns_of(network: Network, group: int) -> set[int]:
     return set(np.flatnonzero(network.turn_group == group).tolist())
+
+
+def an_arrow_for_a_shared_lane(folder: Path) -> Path:
+    """All turns of a road have one lane, and left turns from north and south an arrow: others may stand before it."""
+    shown = (
+        *((20, odd_nets.NORTH_SOUTH), (3, "yyyrrryyyrrr"), (2, odd_nets.DARK)),
+        *((10, "rrGrrrrrGrrr"), (3, "rryrrrrryrrr"), (2, odd_nets.DARK)),
+        *odd_nets.TWO_STAGES[3:],
+    )
+    net = odd_nets.row("C").net(folder, odd_nets.NO_TURNAROUNDS)
+    odd_nets.retime(net, odd_nets.tl_logic("C", shown))
+    return odd_nets.case(folder, odd_nets.traffic("C"))
 
 
 @pytest.fixture
@@ -111,3 +123,35 @@ def test_who_finds_no_gap_gets_the_stage_of_their_own(goes: bool, changes: bool,
         if s != stage and turns_of(arrows, group) & {*arrows.stages[s].turns}
     ]
     assert wishes[-1] in ([*own] if changes else [stage])
+
+
+def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_until_somebody_has(
+    street_of: StreetOf,
+) -> None:
+    network = street_of(an_arrow_for_a_shared_lane)
+    streams = Streams(network)
+    moves = Moves(network, streams, 2).share
+    learning = Yielding(network, streams, moves)
+    arrow = next(row for row, stage in enumerate(streams.stage) if "g" not in network.stages[stage].state)
+    turning = np.flatnonzero(streams.serves[arrow])
+    lane_set = streams.lane_set[turning[0]]
+    own = turning[streams.lane_set[turning] == lane_set]
+    queue = by_the_line(np.full(len(network.groups), QUEUE_VEH))
+    left_veh = np.zeros(len(network.lane_sets))
+
+    def look(now_s: float, row: int) -> None:
+        view = replace(scene(network, now_s), left_veh=left_veh.copy())
+        learning.look(view, np.array([True]), np.array([row]), queue)
+
+    for now_s in np.arange(0.0, BLOCKED_S, 2.0):
+        look(now_s, arrow)
+        assert (moves[arrow, own] == 1).all()
+    for now_s in np.arange(BLOCKED_S, 3 * BLOCKED_S, 2.0):
+        look(now_s, arrow)
+        assert (moves[arrow, own] == LEAST_SHARE).all()
+    # In another stage, in which nobody goes either, that is still so.
+    look(3 * BLOCKED_S, 1 - arrow)
+    assert (moves[arrow, own] == LEAST_SHARE).all()
+    left_veh[lane_set] += 1
+    look(3 * BLOCKED_S + 2, 1 - arrow)
+    assert (moves[arrow, own] == 1).all()

@@ -2,6 +2,10 @@
 
 A left turn that waits for gaps in what comes towards it hardly moves while that has a queue. Where another stage has
 it to itself, that one is to be shown in time.
+
+And who has green does not go at all while the first of his lane has red. Where a stage serves a part of a lane set and
+nobody of its queue has gone for a while, somebody of the other part is in front: that stage is of no use until another
+one has let somebody go.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ import numpy as np
 from utn_controllers.scheduled.standstill import Shown
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
-from utn_sumo.compiling import compiled
+from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
 START_S = 3.0
@@ -22,6 +26,8 @@ FORGET_S = 300.0
 """Over how long what it was is forgotten, and the whole discharge expected again."""
 LEAST_SHARE = 0.05
 """Of the discharge: somebody may always find a gap."""
+BLOCKED_S = 6.0
+"""After so long a green in which nobody of a queue went it is known that who is in front has red."""
 
 
 class Yielding:
@@ -32,6 +38,12 @@ class Yielding:
         self._network, self._streams, self._moves = network, streams, moves
         self.learnt = _give_way(network, streams)
         """(S, L) lane sets that must give way in a stage, and not in another one."""
+        self._partly = _partly(streams, len(network.lane_sets))
+        """(S, L) lane sets of which a stage serves a part."""
+        self._blocked = np.zeros(len(network.lane_sets), dtype=np.bool_)
+        """(L,) lane sets of which who is in front had red in a stage that serves the others."""
+        self._went_s = np.zeros(len(network.lane_sets))
+        """(L,) when somebody left, or nobody was by the stop line, last."""
         self._share = np.ones(self.learnt.shape)
         """(S, L) of the discharge."""
         self._queued = np.zeros(len(network.lane_sets), dtype=np.bool_)
@@ -40,7 +52,7 @@ class Yielding:
         """(J,) when that was."""
         self._left_veh = np.zeros(len(network.lane_sets))
         """(L,) who had left by then."""
-        self._is_needed = bool(self.learnt.any())
+        self._is_needed = bool(self.learnt.any() or self._partly.any())
 
     def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats) -> None:
         """Take up who has gone before the junctions `asked` (J,) in their `present` stage, the row (J,) that it is.
@@ -51,9 +63,9 @@ class Yielding:
             network, streams = self._network, self._streams
             _learn(
                 view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0],
-                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self.learnt,
-                self._share, self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.first,
-                streams.first_stage, streams.serves, self._moves,
+                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self.learnt, self._partly,
+                self._share, self._blocked, self._went_s, self._queued, self._looked_s, self._left_veh,
+                streams.lane_set, streams.first, streams.first_stage, streams.serves, self._moves,
             )  # fmt: skip
 
 
@@ -72,11 +84,21 @@ def _give_way(network: Network, streams: Streams) -> Bools:
     return np.asarray(gives_way & alone[junction])
 
 
+def _partly(streams: Streams, sets: int) -> Bools:
+    """(S, L) lane sets of which some streams have green in a stage and some have red."""
+    some = np.zeros((len(streams.stage), sets), dtype=np.bool_)
+    some_not = np.zeros_like(some)
+    for stream, lane_set in enumerate(streams.lane_set):
+        some[:, lane_set] |= streams.serves[:, stream]
+        some_not[:, lane_set] |= ~streams.serves[:, stream]
+    return np.asarray(some & some_not)
+
+
 @compiled
 def _learn(
     time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, flow: Floats,
-    set_junction: Ints, gives_way: Bools, share: Floats, queued: Bools, looked_s: Floats, before: Floats,
-    stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
+    set_junction: Ints, gives_way: Bools, partly: Bools, share: Floats, blocked: Bools, went_s: Floats, queued: Bools,
+    looked_s: Floats, before: Floats, stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
 ) -> None:  # fmt: skip
     for lane_set, junction in enumerate(set_junction):
         if not asked[junction]:
@@ -88,13 +110,30 @@ def _learn(
             gone = (left[lane_set] - before[lane_set]) / (flow[lane_set] * since_s)
             now = share[row, lane_set] + min(since_s / MEMORY_S, 1.0) * (gone - share[row, lane_set])
             share[row, lane_set] = min(max(now, LEAST_SHARE), 1.0)
+        if left[lane_set] > before[lane_set] or near[lane_set] < 1:
+            went_s[lane_set], blocked[lane_set] = time_s, False
+        elif partly[row, lane_set] and time_s - max(went_s[lane_set], begin_s[junction]) >= BLOCKED_S:
+            blocked[lane_set] = True
         queued[lane_set] = near[lane_set] >= 1
         before[lane_set] = left[lane_set]
     for junction in range(len(asked)):
-        if not asked[junction]:
-            continue
-        looked_s[junction] = time_s
-        for stage in range(first_stage[junction], first_stage[junction + 1]):
-            for stream in range(first[junction], first[junction + 1]):
-                if serves[stage, stream] and gives_way[stage, stream_set[stream]]:
-                    moves[stage, stream - first[junction]] = share[stage, stream_set[stream]]
+        if asked[junction]:
+            looked_s[junction] = time_s
+            _tell(
+                first[junction], first[junction + 1], first_stage[junction], first_stage[junction + 1], stream_set,
+                serves, gives_way, partly, share, blocked, moves,
+            )  # fmt: skip
+
+
+@inlined
+def _tell(
+    first: int, last: int, first_stage: int, last_stage: int, stream_set: Ints, serves: Bools, gives_way: Bools,
+    partly: Bools, share: Floats, blocked: Bools, moves: Floats,
+) -> None:  # fmt: skip
+    """Puts what is known of one junction's lane sets into its `moves`."""
+    for stage in range(first_stage, last_stage):
+        for stream in range(first, last):
+            lane_set = stream_set[stream]
+            if serves[stage, stream] and (gives_way[stage, lane_set] or partly[stage, lane_set]):
+                is_blocked = partly[stage, lane_set] and blocked[lane_set]
+                moves[stage, stream - first] = LEAST_SHARE if is_blocked else share[stage, lane_set]
