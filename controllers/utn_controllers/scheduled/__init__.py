@@ -7,7 +7,11 @@ and others 2012).
 streams.py      what queues before a junction and moves together
 moves.py        what moves in a stage, and in the clearance between two
 gaps.py         who goes in the gaps of what comes towards him
+yielding.py     who gives way, or stands behind a red: how fast he has gone of late
 outlook.py      who stands and who comes, by stream
+pockets.py      who is held up by a full pocket
+worth.py        what a vehicle's waiting weighs, and how many go where links are full
+ending.py       what it costs to leave somebody there at a schedule's end
 standstill.py   who has green and does not go
 traffic.py      what the programme has of those who stand and come
 programme.py    the dynamic programme of one junction

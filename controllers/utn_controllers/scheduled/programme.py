@@ -54,6 +54,7 @@ def schedules(
         while rules.stages[low + present] != stage[junction]:
             present += 1
         stages = rules.first_stage[junction + 1] - low
+        # Two calls: for the compiler None is another type.
         if rules.gaps.some[low : low + stages].any():
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, rules.gaps, stand[a:b], come[a:b], worth[a:b], ends[a:b],
@@ -142,7 +143,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 continue
             row = low + stage
             # What the queues weigh that move, and that have red: these in `veh` as they stood when it began.
-            moving, held, greens = 0.0, 0.0, 0
+            moving, greens = 0.0, 0
             veh[:] = queue[begin, stage]
             while going[row, greens] >= 0:
                 moving += worth[going[row, greens]] * veh[going[row, greens]]

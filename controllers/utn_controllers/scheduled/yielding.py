@@ -31,7 +31,7 @@ BLOCKED_S = 6.0
 
 
 class Yielding:
-    """Keeps which share of its discharge each lane set has in stages in which it gives way."""
+    """Keeps which share of its discharge each lane set has in stages in which it gives way, or in part has red."""
 
     def __init__(self, network: Network, streams: Streams, moves: Floats):
         """`moves` (R, most streams of a junction) of `Rules`, whose rows of stages are kept up to date."""
