@@ -50,7 +50,7 @@ from utn_sumo import (
     streets,
     sumo_tools,
 )
-from utn_sumo.contract import Measurement
+from utn_sumo.contract import Measurement, Network
 from utn_sumo.demand import mean_profile_veh_h
 from utn_sumo.detectors import Miscount
 from utn_sumo.errors import ResultError, SettingError, UtnError
@@ -369,10 +369,16 @@ def scale(side: int, as_json: bool) -> None:
 @click.option("--demands", default="1.0,1.2,1.3,1.5", show_default=True)
 @click.option("--lost", default="0.05,0.08,0.11", show_default=True, help="Shares of the time with no green.")
 @click.option("--measured", metavar="CONTROLLER", help="With the flows that its queues have, seed 1: no bound.")
+@click.option("--unhindered", metavar="SEEDS", help="Delay in SUMO with all green and nobody giving way instead.")
 @click.option("--json", "as_json", is_flag=True)
-def bound(net: str, hours: float, demands: str, lost: str, measured: str | None, as_json: bool) -> None:
+def bound(
+    net: str, hours: float, demands: str, lost: str, measured: str | None, unhindered: str | None, as_json: bool
+) -> None:
     """Delay that no controller can go below: the linear programme of tools/bounding.py."""
     found, rows = streets.named(net), []
+    if unhindered is not None:
+        _unhindered(found, net, hours, _words(demands), unhindered, as_json)
+        return
     for scale in _words(demands):
         flowing = found
         if measured is not None:
@@ -394,6 +400,24 @@ def bound(net: str, hours: float, demands: str, lost: str, measured: str | None,
     cells = [[f"{row['demand']:g}", f"{row['lost']:.0%}", f"{row['least_delay_veh_h']:.0f}"] for row in rows]
     title = f"no less delay on {net}, {hours:g} h" + (f", with the flows of {measured}" if measured else "")
     _show(title, ["demand", "time lost", "veh h"], cells)
+
+
+def _unhindered(found: Network, net: str, hours: float, demands: list[str], unhindered: str, as_json: bool) -> None:
+    """Shows the delay that is left with all signals green and nobody giving way."""
+    rows: list[dict[str, Any]] = []
+    for scale in demands:
+        runs = [scenario(net=net, hours=hours, demand=scale, seed=seed) for seed in campaign.seeds(unhindered)]
+        delays_veh_h = [bounding.unhindered_delay_veh_h(found, chosen) for chosen in runs]
+        rows.append({"demand": float(scale), "unhindered_delay_veh_h": delays_veh_h})
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    cells = [[f"{row['demand']:g}", f"{statistics.mean(row['unhindered_delay_veh_h']):.1f}"] for row in rows]
+    _show(
+        f"delay on {net}, {hours:g} h, seeds {unhindered}",
+        ["demand", "all signals green, nobody gives way: veh h"],
+        cells,
+    )
 
 
 def _words(text: str) -> list[str]:

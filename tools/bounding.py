@@ -7,20 +7,28 @@ vehicles than the junctions can serve. It is below the mean over runs whose dema
 the least delay is convex in the demand; a single run may have drawn less.
 
 With the flows that queues had in a run it is no bound, but what could be had if nobody ever waited at such a red.
+
+Of what the programme leaves out a run tells in which all signals are green at once and nobody gives way: how much delay
+is left where vehicles drive as they do, slow down to turn and hold each other up on the road, and nobody controls them.
 """
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-from utn_sumo import metrics, recording
+from utn_sumo import metrics, recording, sumo_tools, traffic
+from utn_sumo.clearances import HAS_WAY
 from utn_sumo.contract import EXIT, Floats, Network
 from utn_sumo.errors import UtnError
+from utn_sumo.plant.sumo import run_arguments
+from utn_sumo.scenario import Scenario
 
 QUEUE_VEH = 10.0
 """A link with so many standing at both ends of a control step had a queue all through it."""
@@ -116,3 +124,26 @@ def least_delay_veh_h(network: Network, demand_veh_h: Floats, hours: float, *, s
     if found.status != 0:
         raise UtnError(f"there is no bound: {found.message}")
     return float(found.fun)
+
+
+def unhindered_delay_veh_h(network: Network, chosen: Scenario) -> float:
+    """Delay [veh h] of a scenario's own demand in SUMO with all signals green at once and nobody giving way to anybody.
+
+    Raises PlantError if SUMO breaks off.
+    """
+    signals = "".join(
+        f'<tlLogic id={quoteattr(junction.id)} programID="open" type="static" offset="0">'
+        f'<phase duration="3600" state="{HAS_WAY * len(network.stages[junction.stages[0]].state)}"/></tlLogic>'
+        for junction in network.junctions
+    )
+    drivers = '<vType id="DEFAULT_VEHTYPE" jmIgnoreJunctionFoeProb="1"/>'
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        additional = folder / "open.add.xml"
+        additional.write_text(f"<additional>{drivers}{signals}</additional>\n", encoding="utf-8")
+        arguments = run_arguments(
+            network.net_file, traffic.drawn(chosen, network), [additional], folder,
+            seed=chosen.seed, duration_s=chosen.duration_s,
+        )  # fmt: skip
+        sumo_tools.run_program("sumo", [str(sumo_tools.sumo_binary("sumo")), *arguments])
+        return float(metrics.trip_measures(folder / "trips.xml")["total_delay_veh_h"])

@@ -61,3 +61,10 @@ def test_flows_are_those_of_links_that_had_a_queue(utn17: Network, tmp_path: Pat
     bridge.run(scenario(demand=0.2, hours=0.2), tmp_path / "run")
     flowing = bounding.with_flows_of(utn17, tmp_path / "run")
     assert (flowing.saturation_flow_veh_s == utn17.saturation_flow_veh_s).all()
+
+
+def test_who_is_neither_stopped_nor_gives_way_has_less_delay(utn17: Network, tmp_path: Path) -> None:
+    chosen = scenario(controller="recommended", profile="constant", demand=0.8, hours=0.2)
+    controlled = bridge.run(chosen, tmp_path / "run")
+    unhindered_veh_h = bounding.unhindered_delay_veh_h(utn17, chosen)
+    assert 0 < unhindered_veh_h < 0.5 * controlled["total_delay_veh_h"]
