@@ -143,6 +143,7 @@ def run(
         "fallbacks": tally.fallbacks + len(plant.failures),
         "sumo_time_s": plant.sumo_time_s,
         "control_time_s": tally.control_time_s + plant.decision_time_s,
+        "access_time_s": plant.access_time_s,
         "bridge_time_s": elapsed_s - (plant.sumo_time_s - start_s) - tally.control_time_s - plant.decision_time_s,
         "interrupted": interrupted,
         "left_alone": dict(net.left_alone),

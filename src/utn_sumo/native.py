@@ -97,6 +97,7 @@ def measured(
         "fallbacks": 0,
         "sumo_time_s": outcome.sumo_time_s,
         "control_time_s": 0.0,
+        "access_time_s": 0.0,
         "bridge_time_s": time.perf_counter() - started - outcome.sumo_time_s,
         "interrupted": outcome.interrupted,
         "left_alone": dict(judged.left_alone) if judged else {},

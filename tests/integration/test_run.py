@@ -26,7 +26,7 @@ MEASURES = [
     *("controller", "net", "demand", "seed", "hours", "total_time_spent_veh_h", "total_delay_veh_h"),
     *("mean_travel_time_s", "mean_delay_s", "arrived", "unfinished", "max_queue_veh", "max_vehicles_veh"),
     *("over_storage_veh", "stops", "teleports", "unsafe_signal_s", "fallbacks"),
-    *("sumo_time_s", "control_time_s", "bridge_time_s"),
+    *("sumo_time_s", "control_time_s", "access_time_s", "bridge_time_s"),
 ]
 FILES = {"settings.json", "cycles.jsonl", "result.json", "trips.xml", "signals.xml", "routes.rou.xml", "net.net.xml"}
 

@@ -93,6 +93,8 @@ class SumoPlant:
         """Wall time spent inside SUMO: start, steps, close."""
         self.decision_time_s = 0.0
         """Wall time of the execution's decisions, reading what they are made by included."""
+        self.access_time_s = 0.0
+        """Of that, inside SUMO's functions: those that read detectors, found by name, and those that show signals."""
         self.truth: Truth | None = None
         self.waiting: list[tuple[float, Bools]] = []
         """(time, whether somebody stands before the stop line (G,)) at each sample, for the record."""
@@ -257,7 +259,7 @@ class SumoPlant:
 
     def _decide(self, execution: Execution) -> float:
         """Ask the execution if it is time, and show what is due; when there is something to do next."""
-        started = time.perf_counter()
+        started, read_s = time.perf_counter(), self._eyes.sumo_time_s
         heads: Heads = self._heads
         if self.time_s == 0:
             heads.start(self.time_s)
@@ -271,6 +273,7 @@ class SumoPlant:
                 for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
                     heads.switch(index, int(wish[index]), self.time_s)
             self._decision_s += execution.every_s
+        self.access_time_s += self._eyes.sumo_time_s - read_s
         self.decision_time_s += time.perf_counter() - started
         return min(self._decision_s, heads.next_s)
 
@@ -300,7 +303,9 @@ class SumoPlant:
         self.failures.append(f"at {self.time_s:g} s execution: {type(error).__name__}: {error}")
 
     def _show(self, index: int, state: str) -> None:
+        started = time.perf_counter()
         self._set_state(self.network.junctions[index].id, state)
+        self.access_time_s += time.perf_counter() - started
 
     def _present(self) -> int:
         return int(self._sumo.vehicle.getIDCount()) + len(self._sumo.simulation.getPendingVehicles())
