@@ -21,7 +21,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    r: float = Field(0.01, gt=0)
+    r: float = Field(0.01, ge=1e-6, le=1e3)
     """R = r I: weight of the greens [s] squared, beside the vehicles squared over the storage. To be found by trial
     (Aboudolas et al. 2009): 0.1 delays by 2 % less on `utn17` at demand 1.0 and 7 % at 1.3, 1e-4 by 5 % less on other
     nets, 3 % and 21 % more on `utn17`."""

@@ -226,7 +226,7 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
     metavar="NAME[=WHERE]",
     help="A setting and where to search it: low:high, or values with commas, or by itself as far as it may go;"
     " execution.NAME of the execution."
-    "  [every number that has both bounds]",
+    "  [every number that has both bounds, else every choice]",
 )
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the search.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")

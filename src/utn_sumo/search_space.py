@@ -118,7 +118,8 @@ class Space:
 
 
 def space(controller: str, over: Sequence[str] = (), execution: str | None = None) -> Space:
-    """Where the settings of a controller are searched: those named in `over`, else all numbers that have both bounds.
+    """Where the settings of a controller are searched: those named in `over`, else all numbers that have both bounds,
+    or where there are none all choices.
 
     A setting is named as `name=low:high`, as `name=value,value,...`, or alone, for its own range or choices; those of
     an execution likewise, as `execution.name`. Raises UtnError.
@@ -133,14 +134,14 @@ def space(controller: str, over: Sequence[str] = (), execution: str | None = Non
         raise SettingError(f"{whose} has no pydantic `Settings`: there is nothing to search")
     if not over:
         own = {name: _own(each) for name, each in fields.items()}
-        ranges = {name: each for name, each in own.items() if isinstance(each, Range)}
-        if not ranges:
-            name, first = next(iter(own.items()))
+        ranges: dict[str, Range | Choice] = {name: each for name, each in own.items() if isinstance(each, Range)}
+        bounded = ranges or {name: each for name, each in own.items() if each is not None}
+        if not bounded:
             raise SettingError(
-                f"{whose}: none of its settings ({', '.join(fields)}) is a number with both bounds: "
-                f"say where to search, as in --over {name}{'' if first else '=1:10'}"
+                f"{whose}: none of its settings ({', '.join(fields)}) has bounds or choices: "
+                f"say where to search, as in --over {next(iter(fields))}=1:10"
             )
-        return Space(models, ranges)
+        return Space(models, bounded)
     searched = {}
     for text in over:
         name, equals, where = (word.strip() for word in text.partition("="))

@@ -96,6 +96,7 @@ def test_without_a_word_all_numbers_with_both_bounds_are_searched() -> None:
     assert set(space("actuated").searched) == {"min_green_s", "max_green_s", "max_gap_s", "detector_gap_s"}
     assert set(space("priced").searched) == {"every_s"}
     assert space("max_pressure").left == ["count", "per"]
+    assert space("tuc").searched == {"r": Range(1e-6, 1e3, whole=False)}
     assert space("fixed", execution="actuated").searched == {"execution.gap_s": Range(0.06, 60, whole=False)}
     both = space("dmpc", ("relaxation", "execution.gap_s=1:4"), "actuated")
     assert both.defaults == {"relaxation": 1.6, "execution.gap_s": 2.0}
@@ -104,12 +105,18 @@ def test_without_a_word_all_numbers_with_both_bounds_are_searched() -> None:
     assert "'gap_s' is 0" in str(both.refusal({"execution.gap_s": 0.0}))
 
 
+def test_where_no_number_has_both_bounds_all_choices_are_searched() -> None:
+    assert space("cyclic_max_pressure").searched == {
+        "count": Choice(("queue", "vehicles")),
+        "per": Choice(("lane", "storage", "none")),
+    }
+
+
 @pytest.mark.parametrize(
     ("controller", "over", "named"),
     [
         ("max_wav", (), "did you mean 'max_wave'"),
         ("fixed", (), "has no pydantic `Settings`"),
-        ("cyclic_max_pressure", (), "is a number with both bounds: say where to search, as in --over count"),
         ("dmpc", ("execution.gap_s=1:3",), "has no setting 'execution.gap_s'"),
         ("max_wave", ("evry_s=1:2",), "did you mean 'every_s'"),
         ("max_wave", ("every_s=0:2",), "greater than or equal to 1"),
