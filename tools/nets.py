@@ -72,7 +72,7 @@ def one_way_grid(rows: int, columns: int, seed: int = 1) -> Network:
                 for next_link, share in ((along, share_along), (across, 1 - share_along)):
                     served.append(len(turns))
                     to_edge = links[next_link].id if next_link != EXIT else f"exit{row}.{column}"
-                    turns.append(Turn(link, to_edge, next_link, share, (), link))
+                    turns.append(Turn(link, to_edge, next_link, share, (), (), link))
                 own = tuple((2 * position + place,) for place in range(2))
                 lane_sets.append(LaneSet(link, groups[link].lanes, tuple(served), own))
                 letters = "".join("G" if other == position else "r" for other in range(len(here)) for _ in range(2))

@@ -96,6 +96,8 @@ class Turn:
     """beta_{z,d}: share of the link's traffic that takes this turn."""
     via_lanes: tuple[str, ...]
     """SUMO lanes inside the junction that carry this turn and no other."""
+    from_lanes: tuple[int, ...]
+    """Number of the lane of the link's last edge that each of these begins at."""
     group: int
     """Lane group that its traffic queues in."""
 

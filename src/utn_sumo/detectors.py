@@ -22,7 +22,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from utn_sumo.clearances import GIVES_WAY
-from utn_sumo.contract import ZONES_M, Floats, LaneSet, Link, Measurement, Network
+from utn_sumo.contract import ZONES_M, Floats, LaneSet, Link, Measurement, Network, Turn
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -63,7 +63,7 @@ class DetectorIds:
     upstream_zone: tuple[tuple[tuple[str, ...], ...], ...]
     """(Z, zones) those before the lane groups part."""
     amid: tuple[tuple[str, ...], ...]
-    """(M,) of the lane-area detectors amid junctions those of each turn that may wait there, else none."""
+    """(M,) of the lane-area detectors amid junctions those on which each turn may wait, else none."""
 
 
 def ids(network: Network) -> DetectorIds:
@@ -123,7 +123,10 @@ def ids(network: Network) -> DetectorIds:
 
 
 def _amid(network: Network) -> list[tuple[str, ...]]:
-    """(M,) lanes amid junctions on which each turn waits that gives way in some stage, and all where people walk."""
+    """(M,) lanes amid junctions on which each turn waits that gives way in some stage, or behind one that does.
+
+    All where people walk.
+    """
     waiting = {
         turn
         for junction in network.junctions
@@ -131,7 +134,13 @@ def _amid(network: Network) -> list[tuple[str, ...]]:
         if junction.is_walked or any(network.stages[stage].state[letter] == GIVES_WAY for stage in junction.stages)
         for turn in turns
     }
-    return [turn.via_lanes if index in waiting else () for index, turn in enumerate(network.turns)]
+    shared = {(network.turns[turn].link, lane) for turn in waiting for lane in network.turns[turn].from_lanes}
+
+    def lanes(index: int, turn: Turn) -> tuple[str, ...]:
+        ways = zip(turn.via_lanes, turn.from_lanes, strict=True)
+        return tuple(via for via, lane in ways if index in waiting or (turn.link, lane) in shared)
+
+    return [lanes(index, turn) for index, turn in enumerate(network.turns)]
 
 
 def _named(kind: str, lane: str) -> str:

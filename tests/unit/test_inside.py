@@ -26,10 +26,14 @@ class Traffic:
 
     def __init__(self) -> None:
         self.inside_veh: dict[int, float] = defaultdict(float)
+        self.standing_veh: dict[int, float] = defaultdict(float)
         self.coming_veh: dict[int, float] = defaultdict(float)
 
     def amid_veh(self, turn: int) -> float:
         return self.inside_veh[turn]
+
+    def stuck_veh(self, turn: int) -> float:
+        return self.standing_veh[turn]
 
     def close_veh(self, group: int) -> float:
         return self.coming_veh[group]
@@ -195,9 +199,38 @@ def test_nobody_is_held_for_one_who_has_left_or_has_green_in_the_next_stage(walk
         assert not walked.holds_for(next_turn, *everybody)
 
 
+def test_who_stands_behind_a_turn_that_shares_its_lane_holds_those_who_would_come_into_its_way(
+    street_of: StreetOf,
+) -> None:
+    network = street_of(odd_nets.plain)
+    first, then = network.junctions[0].stages
+    giving, going = (_turns_with(network, first, letters) for letters in "gG")
+    ahead = next(turn for turn in going if any(network.turns[turn].link == network.turns[left].link for left in giving))
+    left = next(turn for turn in giving if network.turns[turn].link == network.turns[ahead].link)
+    assert set(network.turns[ahead].from_lanes) & set(network.turns[left].from_lanes)
+    traffic = Traffic()
+    inside = Inside(network, traffic)
+    for turn, is_held in ((ahead, True), (left, False)):
+        traffic.standing_veh = defaultdict(float, {turn: 1.0})
+        traffic.inside_veh = defaultdict(float, {turn: 1.0})
+        for groups in ({network.turns[other].group for other in _turns_with(network, then, "gG")}, set[int]()):
+            traffic.coming_veh = defaultdict(float, dict.fromkeys(groups, 1.0))
+            inside.leads(0, first, then, 23.0)
+            assert inside.holds(0, 23.0) == (is_held and len(groups) > 0)
+            assert not inside.holds(0, 23.0 + MOST_HOLD_S)
+    # Who drives is not waited for, nor who has green in the next stage too.
+    everybody = defaultdict(float, dict.fromkeys(range(len(network.groups)), 1.0))
+    traffic.standing_veh, traffic.inside_veh, traffic.coming_veh = defaultdict(float), {ahead: 1.0}, everybody
+    inside.leads(0, first, then, 23.0)
+    assert not inside.holds(0, 23.0)
+    traffic.standing_veh = defaultdict(float, {ahead: 1.0})
+    inside.leads(0, then, first, 23.0)
+    assert not inside.holds(0, 23.0)
+
+
 def test_where_no_turn_gives_way_nobody_is_ever_waited_for(utn17: Network) -> None:
     traffic = Traffic()
-    traffic.inside_veh = traffic.coming_veh = defaultdict(lambda: 1.0)
+    traffic.inside_veh = traffic.standing_veh = traffic.coming_veh = defaultdict(lambda: 1.0)
     inside = Inside(utn17, traffic)
     assert not inside.may_hold().any()
     for index, junction in enumerate(utn17.junctions):

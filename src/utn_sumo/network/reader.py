@@ -249,6 +249,7 @@ class _Reader:
             targets = sorted((edge for edge, each in outgoing.items() if each), key=lambda edge: _natural(edge.getID()))
             shares = self._shares(edge_id, {edge.getID(): outgoing[edge] for edge in targets})
             lanes = [tuple(sorted({each.getFromLane().getIndex() for each in outgoing[edge]})) for edge in targets]
+            inside = {edge: _via_lanes(outgoing[edge]) for edge in targets}
             found = lane_groups(zip((edge.getID() for edge in targets), lanes, strict=True))
             lanes_of += lanes
             group_of = {name: len(groups) + place for place, (_, names) in enumerate(found) for name in names}
@@ -259,7 +260,8 @@ class _Reader:
                     to_edge=edge.getID(),
                     next_link=self.link_from.get(edge.getID(), EXIT),
                     fraction=share,
-                    via_lanes=_via_lanes(outgoing[edge]),
+                    via_lanes=tuple(via for via, _ in inside[edge]),
+                    from_lanes=tuple(lane for _, lane in inside[edge]),
                     group=group_of[edge.getID()],
                 )
                 for edge, share in zip(targets, shares, strict=True)
@@ -357,12 +359,13 @@ def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]], u
     )
 
 
-def _via_lanes(connections: list[Any]) -> tuple[str, ...]:
-    lanes = [connection.getViaLaneID() for connection in connections]
-    if not all(lanes):
+def _via_lanes(connections: list[Any]) -> list[tuple[str, int]]:
+    """The lane inside the junction that each of a turn's connections takes, and the number of that it begins at."""
+    lanes = [(connection.getViaLaneID(), connection.getFromLane().getIndex()) for connection in connections]
+    if not all(via for via, _ in lanes):
         edge = connections[0].getFrom().getID()
         raise NetworkError(f"link {edge!r} has no lanes inside its junction: build the net with internal links")
-    return tuple(sorted(lanes))
+    return sorted(lanes)
 
 
 def _read_fractions(net_path: Path) -> dict[tuple[str, str], float]:

@@ -3,9 +3,10 @@
 Those who found no gap in oncoming traffic have a stage of their own then, in the net's own programme. Where that one is
 left out, the next road's green finds them in its way, its own turns come to stand beside them, and when those of all
 roads wait for each other nobody ever moves again. Where people walk, whoever came in late is stopped amid the junction
-too, turning or not: by those who step onto the crossing at its exit with the next green, or behind one who is. So while
-the lane-area detectors amid it see such vehicles, and others are about to come into their way, the red before the next
-green lasts.
+too, turning or not: by those who step onto the crossing at its exit with the next green, or behind one who is. And who
+goes straight on from a lane that turns share may stand behind one of them until the green has ended, and is amid the
+junction when the next road's turns come into it. So while the lane-area detectors amid it see such vehicles, and others
+are about to come into their way, the red before the next green lasts.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ class Areas(Protocol):
     """What it takes to know who waits (plant.eyes)."""
 
     def amid_veh(self, turn: int) -> float: ...
+    def stuck_veh(self, turn: int) -> float: ...
     def close_veh(self, group: int) -> float: ...
 
 
@@ -53,6 +55,8 @@ class Way:
     """Lane groups of turns that give way in it."""
     before_walks: tuple[tuple[int, tuple[int, ...]], ...]
     """Turns that people who walk may stop, each with the lane groups that come into its way."""
+    behind: tuple[tuple[int, tuple[int, ...]], ...]
+    """Likewise turns that may stand behind one that found no gap."""
 
 
 class Inside:
@@ -88,15 +92,27 @@ class Inside:
             for turn in each.turns
         ]
         coming = [group for each in turnings if becomes[each.letter] == GIVES_WAY for group in each.groups]
-        before_walks = [
+        stopped = tuple(
             (turn, _into_its_way(network, junction, letter, becomes))
             for letter, turns in enumerate(junction.signal_turns)
-            if junction.is_walked and becomes[letter] not in GREEN
+            if becomes[letter] not in GREEN
             for turn in turns
-        ]
-        # To the stage that follows it is the net's own clearance, to the second, but for who walks.
+        )
+        giving = {turn for each in turnings for turn in each.turns}
+        lanes = {lane for turn in giving for lane in _lanes(network, turn)}
+        behind = tuple(
+            (turn, groups)
+            for turn, groups in stopped
+            if turn not in giving and not lanes.isdisjoint(_lanes(network, turn))
+        )
+        # To the stage that follows it is the net's own clearance, to the second, but for who walks or is stuck.
         is_own = then == following(junction, first)
-        return Way(() if is_own else tuple(left), tuple(coming), tuple(before_walks))
+        return Way(
+            left=() if is_own else tuple(left),
+            coming=tuple(coming),
+            before_walks=stopped if junction.is_walked else (),
+            behind=() if junction.is_walked else behind,
+        )
 
     def holds(self, index: int, now_s: float) -> bool:
         """Whether the stage that a junction is led to has to wait for somebody."""
@@ -107,9 +123,15 @@ class Inside:
         if found_no_gap and any(areas.close_veh(group) > 0 for group in way.coming):
             return True
         return any(
-            areas.amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
-            for turn, groups in way.before_walks
+            is_there(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
+            for is_there, stopped in ((areas.amid_veh, way.before_walks), (areas.stuck_veh, way.behind))
+            for turn, groups in stopped
         )
+
+
+def _lanes(network: Network, turn: int) -> set[tuple[int, int]]:
+    """Lanes before the stop line, as link and number, from which a turn goes."""
+    return {(network.turns[turn].link, lane) for lane in network.turns[turn].from_lanes}
 
 
 def _into_its_way(network: Network, junction: Junction, letter: int, state: str) -> tuple[int, ...]:
