@@ -135,7 +135,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     others, veh = np.empty(stages, np.int64), np.empty(streams)
     pace, want = np.ones(streams), np.zeros(streams)
-    stood, left, still, then = np.empty((4, stages + 1))
+    stood, left = np.empty((2, stages + 1))
     for begin in range(bins):
         for stage in range(stages):
             spent = cost[begin, stage]
@@ -165,15 +165,6 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 if now >= may_end and (goes or now == may_end):
                     # It ends here: others begin after their clearance, where that is the best way there.
                     won, won_in = 0.0, -1
-                    # As `stood` and `left`, with those who had green.
-                    still[:], then[:] = stood, left
-                    for place in range(greens):
-                        stream = going[row, place]
-                        before = veh[stream] - came[stream, now]
-                        for other in range(stages + 1):
-                            if other == stages or moves[low + other, stream] == 0:
-                                still[other] += worth[stream] * before
-                                then[other] += ends[stream] * before
                     for place in range(nexts):
                         other = others[place]
                         opens = min(now + clearance[row, other], bins)
@@ -181,7 +172,10 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                             continue
                         until = spent + _held(stages, grown, paid, now, opens, held + moving)
                         if opens == bins:
-                            until += then[stages] + due[stages, bins]
+                            until += left[stages] + due[stages, bins]
+                            for nth in range(greens):
+                                stream = going[row, nth]
+                                until += ends[stream] * (veh[stream] - came[stream, now])
                         if clearing[row, other] >= 0:
                             if clearing[row, other] != won_in:
                                 won_in = clearing[row, other]
@@ -193,9 +187,16 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                             continue
                         behind = 0.0
                         if opens < bins:
+                            # As `stood` and `left`, with those who had green and will not have it then.
+                            still, then = stood[other], left[other]
+                            for nth in range(greens):
+                                stream = going[row, nth]
+                                if moves[low + other, stream] == 0:
+                                    before = veh[stream] - came[stream, now]
+                                    still += worth[stream] * before
+                                    then += ends[stream] * before
                             rest_bins = bins - opens
-                            behind = rest_bins * (grown[other, opens] + still[other])
-                            behind += due[other, opens] + then[other]
+                            behind = rest_bins * (grown[other, opens] + still) + due[other, opens] + then
                             if clearing[row, other] >= 0:
                                 behind -= _gone(
                                     clearing[row, other], begin, row, now, opens, low + other, veh, moves, going,
