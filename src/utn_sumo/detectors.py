@@ -8,7 +8,8 @@ turns apart. All report once a control step, which is when they are read: interv
 6).
 
 Where an execution decides within the control step, more lane-area detectors cut the same 200 m into zones, and some see
-who waits amid a junction because their green gives way to others, or who is amid it late where people walk.
+who waits amid a junction because their green gives way to others, or behind these, or who is amid it late where people
+walk.
 """
 
 from __future__ import annotations

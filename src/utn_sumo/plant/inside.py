@@ -53,10 +53,9 @@ class Way:
     """Turns for whom no gap in oncoming traffic may have come, and whom the next stage does not let out."""
     coming: tuple[int, ...]
     """Lane groups of turns that give way in it."""
-    before_walks: tuple[tuple[int, tuple[int, ...]], ...]
-    """Turns that people who walk may stop, each with the lane groups that come into its way."""
-    behind: tuple[tuple[int, tuple[int, ...]], ...]
-    """Likewise turns that may stand behind one that found no gap."""
+    stopped: tuple[tuple[int, tuple[int, ...]], ...]
+    """Turns that people who walk may stop, or one before them that found no gap, each with the lane groups that come
+    into its way."""
 
 
 class Inside:
@@ -66,6 +65,8 @@ class Inside:
         self._network = network
         self._areas = areas
         self._turnings = [_turnings(network, junction) for junction in network.junctions]
+        self._behind = _sharing(network, {turn for own in self._turnings for each in own for turn in each.turns})
+        """Turns that may stand behind one that found no gap."""
         self._known: dict[tuple[int, int, int], Way] = {}
         """By junction and its stages from which and to which they lead."""
         self._ways: dict[int, tuple[Way, float]] = {}
@@ -97,22 +98,11 @@ class Inside:
             for letter, turns in enumerate(junction.signal_turns)
             if becomes[letter] not in GREEN
             for turn in turns
-        )
-        giving = {turn for each in turnings for turn in each.turns}
-        lanes = {lane for turn in giving for lane in _lanes(network, turn)}
-        behind = tuple(
-            (turn, groups)
-            for turn, groups in stopped
-            if turn not in giving and not lanes.isdisjoint(_lanes(network, turn))
+            if junction.is_walked or turn in self._behind
         )
         # To the stage that follows it is the net's own clearance, to the second, but for who walks or is stuck.
         is_own = then == following(junction, first)
-        return Way(
-            left=() if is_own else tuple(left),
-            coming=tuple(coming),
-            before_walks=stopped if junction.is_walked else (),
-            behind=() if junction.is_walked else behind,
-        )
+        return Way(() if is_own else tuple(left), tuple(coming), stopped)
 
     def holds(self, index: int, now_s: float) -> bool:
         """Whether the stage that a junction is led to has to wait for somebody."""
@@ -122,16 +112,16 @@ class Inside:
         found_no_gap = sum(areas.amid_veh(turn) for turn in way.left) > ALONE_VEH
         if found_no_gap and any(areas.close_veh(group) > 0 for group in way.coming):
             return True
+        is_there = areas.amid_veh if self._network.junctions[index].is_walked else areas.stuck_veh
         return any(
-            is_there(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
-            for is_there, stopped in ((areas.amid_veh, way.before_walks), (areas.stuck_veh, way.behind))
-            for turn, groups in stopped
+            is_there(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups) for turn, groups in way.stopped
         )
 
 
-def _lanes(network: Network, turn: int) -> set[tuple[int, int]]:
-    """Lanes before the stop line, as link and number, from which a turn goes."""
-    return {(network.turns[turn].link, lane) for lane in network.turns[turn].from_lanes}
+def _sharing(network: Network, giving: set[int]) -> set[int]:
+    """Turns that share a lane with some of those that are `giving` way, and are none of them."""
+    sets = (lane_set.turns for lane_set in network.lane_sets)
+    return {turn for turns in sets if not giving.isdisjoint(turns) for turn in turns} - giving
 
 
 def _into_its_way(network: Network, junction: Junction, letter: int, state: str) -> tuple[int, ...]:
