@@ -713,7 +713,7 @@ class Execution(Protocol):
     """
 
     every_s: float
-    """Time between two decisions: a second or more."""
+    """Time until the next decision, read anew after each: a second or more."""
 
     def begin(self, plan: Plan, state: State) -> None:
         """Take up the plan of a new control step, and the state that it was made from."""
