@@ -49,6 +49,11 @@ class Counts(Keeps):
         self.due_s += self.every_s
         return view.stage
 
+class Wavers(Counts):
+    def wish(self, view):
+        self.every_s = 1 + self.due_s % 4
+        return super().wish(view)
+
 class Hasty(Keeps):
     def __init__(self, network):
         self.every_s = 0
@@ -121,9 +126,12 @@ def test_an_execution_that_fails_is_written_down_and_everybody_still_gets_green(
     assert result["arrived"] > 50
 
 
-def test_an_execution_is_asked_every_time_whether_a_junction_is_free_or_none(own: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["Counts", "Wavers"])
+def test_an_execution_is_asked_every_time_whether_a_junction_is_free_or_none(
+    own: str, name: str, tmp_path: Path
+) -> None:
     """It may keep in mind what has come since: all junctions begin with a least green in which none is free."""
-    chosen = scenario(controller="fixed", execution=f"{own}:Counts", hours=0.05)
+    chosen = scenario(controller="fixed", execution=f"{own}:{name}", hours=0.05)
     assert bridge.run(chosen, tmp_path / "run")["fallback_reasons"] == []
 
 
