@@ -27,8 +27,10 @@ MOST_CYCLES = 3
 """Longest cycles between two decisions that junctions with different cycles make necessary."""
 AREA_REACH_M = 200.0
 """Lane-area detectors see this far upstream of the stop line: the reach of a camera on the mast."""
-ZONES_M = (22.0, 50.0, 100.0, AREA_REACH_M)
+ZONES_M = (22.0, 50.0, 85.0, 130.0, AREA_REACH_M)
 """How far from the stop line the zones end in which they say where vehicles are: the nearer the finer."""
+CLOSE_ZONES = 2
+"""Who is in these, up to 50 m, is at the stop line within a few seconds."""
 SAMPLE_S = 10.0
 """Longest time between two readings of the entry loops (the paper's sampling interval)."""
 

@@ -15,7 +15,7 @@ from tests.integration import odd_nets
 from tests.unit.views import scene
 from utn_sumo.contract import Floats, Network
 from utn_sumo.plant.heads import Heads
-from utn_sumo.plant.patience import LONGEST_RED_S, LOOK_S, MOST_PATIENCE_S, Patience
+from utn_sumo.plant.patience import LONGEST_RED_S, LOOK_S, MOST_PATIENCE_S, PAUSE_S, Patience
 
 StreetOf = Callable[[Callable[[Path], Path]], Network]
 
@@ -37,7 +37,7 @@ def test_who_waits_too_long_comes_next_and_who_does_not_wait_does_not(utn17: Net
 
 
 def test_who_creeps_on_for_a_moment_waits_still_and_who_has_gone_does_not(utn17: Network) -> None:
-    for unseen_s, forced in ((LOOK_S, True), (2 * LOOK_S, False)):
+    for unseen_s, forced in ((LOOK_S, True), (PAUSE_S, True), (PAUSE_S + LOOK_S, False)):
         patience = Patience(utn17, no_holds(utn17))
         for time_s in np.arange(0, MOST_PATIENCE_S + LOOK_S, LOOK_S):
             stands = not 60 <= time_s < 60 + unseen_s

@@ -22,7 +22,7 @@ from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.moves import Moves, Rules, going
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import EXIT, Floats, Ints, Network
+from utn_sumo.contract import EXIT, ZONES_M, Floats, Ints, Network
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.heads import Heads
 
@@ -51,6 +51,8 @@ class Crossing:
     """Bins that who is left at the end waits longer."""
     needing: tuple[float, ...] = ()
     """(N,) what each of these weighs beside that: else nothing."""
+    then: int = field(default=-1, init=False)
+    """The stage led to in the bin after that of the last decision, as it foresaw."""
 
     def green(self) -> Floats:
         """(S, N) share of its discharge that each stream has in each stage."""
@@ -104,7 +106,7 @@ class Crossing:
         stages = len(self.clearance)
         plan = np.zeros(self.bins, dtype=np.int64) if plan is None else plan
         sent = np.zeros((stages, self.bins)) if sent is None else sent.copy()
-        wish = schedules(
+        wish, then = schedules(
             np.array([stage]),
             np.array([free]),
             np.array([self.bins if rest is None else rest]),
@@ -117,6 +119,8 @@ class Crossing:
             plan[None].copy(),
             sent,
         )
+        assert wish[0] in (stage, then[0])
+        self.then = int(then[0])
         return int(wish[0]), sent
 
     def begins(self, stand: object, come: Floats, most: object = 1.0) -> list[tuple[int, int, Floats]]:
@@ -611,6 +615,74 @@ def next_in_cycle(network: Network) -> Ints:
     for junction in network.junctions:
         after[list(junction.stages)] = np.roll(junction.stages, -1)
     return after
+
+
+class TestSooner:
+    """A green that is to end with the bin ends within it, once nobody is close any more whom that would stop."""
+
+    def scenes(self, network: Network, waiting_veh: float) -> tuple[Scene, Scene]:
+        """Two by the line before green and so many before all others; and a second later, when they have gone."""
+        stages = [junction.stages[0] for junction in network.junctions]
+        green = network.serves[stages].any(axis=0)
+        line_veh = np.full(len(network.groups), waiting_veh)
+        line_veh[network.turn_group[green]] = 2.0
+        gone_veh = line_veh.copy()
+        gone_veh[network.turn_group[green]] = 0.0
+        view = scene(network, 6.0)
+        return tuple(
+            replace(view, time_s=time_s, set_zone_veh=by_the_line(veh))
+            for time_s, veh in ((6.0, line_veh), (7.0, gone_veh))
+        )
+
+    def test_it_ends_when_nobody_is_left_by_the_line_and_not_before(self, utn17: Network) -> None:
+        view, gone = self.scenes(utn17, 3.0)
+        for then, goes in ((replace(view, time_s=7.0), False), (gone, True)):
+            execution = Scheduled(utn17)
+            assert (execution.wish(view) == view.stage).all()
+            assert execution.every_s == 1
+            assert ((execution.wish(then) != view.stage) == goes).all()
+            # The next decision is when it would have been anyway.
+            assert execution.every_s == 1
+
+    @pytest.mark.parametrize("zone", range(len(ZONES_M)))
+    @pytest.mark.parametrize("where", ["set_zone_veh", "link_zone_veh"])
+    def test_it_waits_for_who_is_within_50_m_on_its_lanes_or_before_they_part(
+        self, utn17: Network, zone: int, where: str
+    ) -> None:
+        view, gone = self.scenes(utn17, 3.0)
+        execution = Scheduled(utn17)
+        execution.wish(view)
+        veh = getattr(gone, where).copy()
+        veh[:, zone] += 1
+        assert ((execution.wish(replace(gone, **{where: veh})) == view.stage) == (ZONES_M[zone] <= 50)).all()
+
+    def test_it_leads_where_the_schedule_was_to_go(self, utn17: Network) -> None:
+        view, gone = self.scenes(utn17, 3.0)
+        sooner, later = Scheduled(utn17), Scheduled(utn17)
+        for execution in (sooner, later):
+            execution.wish(view)
+        led = sooner.wish(gone)
+        assert (later.wish(replace(view, time_s=7.0)) == view.stage).all()
+        assert (led == later.wish(replace(gone, time_s=8.0))).all()
+
+    def test_it_stays_where_a_junction_may_not_go_and_is_not_looked_at_where_nobody_waits(self, utn17: Network) -> None:
+        view, gone = self.scenes(utn17, 3.0)
+        free = np.arange(len(utn17.junctions)) % 2 == 0
+        execution = Scheduled(utn17)
+        execution.wish(view)
+        assert ((execution.wish(replace(gone, free=free)) != view.stage) == free).all()
+        view, _ = self.scenes(utn17, 0.0)
+        execution = Scheduled(utn17)
+        execution.wish(view)
+        assert execution.every_s == 2
+
+    @pytest.mark.parametrize(("stand", "then"), [((1.0, 6.0), 1), ((0.0, 0.0), 0), ((9.0, 1.0), 0)])
+    def test_it_is_foreseen_by_the_schedule(self, stand: tuple[float, ...], then: int) -> None:
+        crossing = Crossing()
+        assert crossing.decide(stand)[0] == 0
+        assert crossing.then == then
+        crossing.decide(stand, free=False)
+        assert crossing.then == 0
 
 
 class TestExecution:

@@ -17,10 +17,12 @@ from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.worth import Worth
 from utn_controllers.scheduled.yielding import Yielding
-from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
+from utn_sumo.contract import CLOSE_ZONES, ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
 
 BIN_S = 2
 """Length of a bin, and time between two decisions."""
+SOONER_S = 1
+"""After a decision by which a green ends with the bin it is looked so soon whether it has let go all that it will."""
 
 
 class ScheduledSettings(BaseModel):
@@ -91,6 +93,10 @@ class Scheduled:
         """(J, K) the last schedules."""
         self._row = np.argsort(stages)
         """(S,) row of the rules in which each of the network's stages is."""
+        self._then = np.zeros(len(network.junctions), dtype=np.int64)
+        """(J,) stage that each junction is to be led to at the next decision, or stays in."""
+        self._is_sooner = False
+        """Whether it is looked next before that, at who could be led there already."""
         self._endless = np.full(len(network.junctions), bins)
         self._green_s: Floats | None = None
         self._take_up()
@@ -107,6 +113,9 @@ class Scheduled:
 
     def wish(self, view: View | _Nobody) -> Ints:
         """(J,) stage that each junction's schedule begins with."""
+        if self._is_sooner:
+            self._is_sooner, self.every_s = False, BIN_S - SOONER_S
+            return self._sooner(view)
         zones, present = view.zone_veh(view.free), self._row[view.stage]
         outlook = self._outlook
         stand, come, held = outlook.look(view, zones)
@@ -119,21 +128,36 @@ class Scheduled:
         else:
             rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
             rest = np.clip(rest_s / BIN_S, 0, self._plan.shape[1]).astype(np.int64)
-        return np.asarray(
-            schedules(
-                view.stage,
-                view.free,
-                rest,
-                self._rules,
-                stand,
-                come,
-                worth,
-                self._ending.weights(worth),
-                most,
-                self._plan,
-                outlook.sent_veh,
-            )
+        wish, self._then = schedules(
+            view.stage,
+            view.free,
+            rest,
+            self._rules,
+            stand,
+            come,
+            worth,
+            self._ending.weights(worth),
+            most,
+            self._plan,
+            outlook.sent_veh,
         )
+        self._is_sooner = bool((self._then != wish).any())
+        self.every_s = SOONER_S if self._is_sooner else BIN_S
+        return np.asarray(wish)
+
+    def _sooner(self, view: View | _Nobody) -> Ints:
+        """(J,) the present stages, but the next one where nobody is close any more whom it stops."""
+        streams, wish = self._streams, view.stage.copy()
+        ending = (self._then != view.stage) & view.free
+        of_set, before = (zone[:, :CLOSE_ZONES].sum(axis=1) for zone in view.zone_veh(ending))
+        close_veh = of_set + before[self.network.set_link]
+        for junction in ending.nonzero()[0].tolist():
+            own = slice(*streams.first[junction : junction + 2])
+            present, then = self._row[view.stage[junction]], self._row[self._then[junction]]
+            stopped = streams.serves[present, own] & ~streams.serves[then, own]
+            if not close_veh[streams.lane_set[own][stopped]].any():
+                wish[junction] = self._then[junction]
+        return wish
 
     def _warm_up(self) -> None:
         """Have the machine code made now, not at the first decision."""

@@ -33,8 +33,10 @@ ALIKE = 1e-9
 def schedules(
     stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats, ends: Floats,
     most: Floats, plan: Ints, sent: Floats,
-) -> Ints:  # fmt: skip
+) -> tuple[Ints, Ints]:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
+
+    And (J,) the same of the next bin, as far as it is foreseen.
 
     `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
     weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `most` (N,) that leave in a bin of green.
@@ -43,7 +45,7 @@ def schedules(
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
     not free, what is left of the last one.
     """
-    wish = stage.copy()
+    wish, then = stage.copy(), stage.copy()
     for junction in range(len(stage)):
         a, b = rules.first[junction], rules.first[junction + 1]
         plan[junction, :-1] = plan[junction, 1:]
@@ -66,7 +68,13 @@ def schedules(
                 most[a:b], plan[junction], sent[a:b],
             )  # fmt: skip
         wish[junction] = rules.stages[low + chosen]
-    return wish
+        then[junction] = wish[junction]
+        if chosen == present and plan[junction, 1] != low + present:
+            for row in plan[junction, 1:]:
+                if low <= row < low + stages:
+                    then[junction] = rules.stages[row]
+                    break
+    return wish, then
 
 
 @compiled

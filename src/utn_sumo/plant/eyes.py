@@ -11,12 +11,9 @@ from typing import Any
 import numpy as np
 
 from utn_sumo.compiling import compiled
-from utn_sumo.contract import EXIT, ZONES_M, Bools, Floats, Ints, Network
+from utn_sumo.contract import CLOSE_ZONES, EXIT, ZONES_M, Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.heads import Heads
-
-CLOSE_ZONES = 2
-"""Who is in these, up to 50 m, is at the stop line within a few seconds."""
 
 
 class Eyes:

@@ -18,7 +18,9 @@ MOST_PATIENCE_S = 150.0
 LONGEST_RED_S = 180.0
 """Where least greens and clearances are long it comes next sooner: nobody is to wait longer than this."""
 LOOK_S = 5.0
-"""Time between two looks at who waits."""
+"""Time between two looks at who waits, or a little more."""
+PAUSE_S = 10.0
+"""Who has stood so short a time ago waits still: in a queue that creeps nobody stands for a moment."""
 
 
 class Patience:
@@ -41,8 +43,8 @@ class Patience:
         """(J,) before somebody has waited so long all can be served, whoever they are and whatever is wished."""
         self._since_s = np.zeros(self._needs.shape[1])
         """(M + walks,) since when somebody has been waiting for each, without green meanwhile."""
-        self._stood = np.zeros(self._needs.shape[1], dtype=np.bool_)
-        """(M + walks,) whether somebody stood before each at the last look: who creeps on for a moment waits still."""
+        self._stood_s = np.full(self._needs.shape[1], -np.inf)
+        """(M + walks,) when somebody was last seen standing before each."""
         self._look_s = 0.0
         """When it is looked again who waits."""
         self._next: dict[int, tuple[int, float]] = {}
@@ -66,7 +68,7 @@ class Patience:
     def _look(self, view: View) -> None:
         waits, troubled = _look(
             view.time_s, view.stage, view.waiting_veh, self._turn_group, self._needs, self._served, self._junction,
-            self._carefree_s, self._stood, self._since_s,
+            self._carefree_s, self._stood_s, self._since_s,
         )  # fmt: skip
         self._next = {
             junction: self._first(
@@ -80,7 +82,7 @@ class Patience:
         stage = np.array([junction.stages[0] for junction in network.junctions], dtype=np.int64)
         _look(
             0.0, stage, np.zeros(len(network.groups)), self._turn_group, self._needs, self._served, self._junction,
-            self._carefree_s, self._stood.copy(), self._since_s.copy(),
+            self._carefree_s, self._stood_s.copy(), self._since_s.copy(),
         )  # fmt: skip
 
     def _first(self, present: int, waiting: Ints, now_s: float) -> tuple[int, float]:
@@ -101,16 +103,16 @@ class Patience:
 @compiled
 def _look(
     time_s: float, stage: Ints, waiting: Floats, turn_group: Ints, needs: Bools, served: Bools, junction: Ints,
-    carefree_s: Floats, stood: Bools, since_s: Floats,
+    carefree_s: Floats, stood_s: Floats, since_s: Floats,
 ) -> tuple[Bools, Bools]:  # fmt: skip
-    """(M + walks,) who waits without green, (J,) where somebody's time may come; keeps `stood` and `since_s`."""
+    """(M + walks,) who waits without green, (J,) where somebody's time may come; keeps `stood_s` and `since_s`."""
     waits, troubled = np.zeros(len(since_s), np.bool_), np.zeros(len(carefree_s), np.bool_)
     for each in range(len(since_s)):
         # Pedestrians, whom no detector sees, may always be waiting.
-        stands = each >= len(turn_group) or waiting[turn_group[each]] > 0
+        if each >= len(turn_group) or waiting[turn_group[each]] > 0:
+            stood_s[each] = time_s
         is_red = served[each] and not needs[stage[junction[each]], each]
-        waits[each] = (stands or stood[each]) and is_red
-        stood[each] = stands
+        waits[each] = time_s - stood_s[each] <= PAUSE_S and is_red
         if not waits[each]:
             since_s[each] = time_s
         elif since_s[each] + carefree_s[junction[each]] <= time_s:
