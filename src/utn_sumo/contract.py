@@ -697,6 +697,10 @@ class View(Protocol):
         """
         ...
 
+    def close_one_veh(self, lane_set: int) -> float:
+        """Vehicles within 50 m of the stop line (CLOSE_ZONES) on one lane set, or before its lanes part from others."""
+        ...
+
     def near_one_veh(self, group: int) -> float:
         """What `near_veh` has for one lane group, for whom the others are no matter."""
         ...

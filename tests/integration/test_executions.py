@@ -229,7 +229,7 @@ def test_who_stands_amid_a_junction_is_stuck_unless_the_road_ahead_is_what_stops
 SEES = """
 import libsumo
 import numpy as np
-from utn_sumo.contract import ZONES_M
+from utn_sumo.contract import CLOSE_ZONES, ZONES_M
 
 class Sees:
     every_s = 3
@@ -239,7 +239,9 @@ class Sees:
         pass
     def wish(self, view):
         off, all_veh = 0.0, 0
-        zone_veh, _ = view.zone_veh(np.ones(len(self.network.junctions), dtype=bool))
+        zone_veh, before_veh = view.zone_veh(np.ones(len(self.network.junctions), dtype=bool))
+        close_veh = zone_veh[:, :CLOSE_ZONES].sum(axis=1) + before_veh[self.network.set_link, :CLOSE_ZONES].sum(axis=1)
+        assert [view.close_one_veh(lane_set) for lane_set in range(len(close_veh))] == close_veh.tolist()
         for group, lanes in enumerate(self.network.groups):
             edge = self.network.links[lanes.link].edges[-1]
             away_m = [

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
+from utn_sumo.contract import CLOSE_ZONES, ZONES_M, Bools, Floats, Ints, Network
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class Scene:
     gap_s: Floats
     entered_veh: Floats
     left_veh: Floats
+    set_link: Ints
     set_junction: Ints
     link_junction: Ints
 
@@ -33,6 +34,10 @@ class Scene:
             np.where(junctions[self.set_junction][:, None], self.set_zone_veh, 0.0),
             np.where(junctions[self.link_junction][:, None], self.link_zone_veh, 0.0),
         )
+
+    def close_one_veh(self, lane_set: int) -> float:
+        before = self.link_zone_veh[self.set_link[lane_set]]
+        return float(self.set_zone_veh[lane_set, :CLOSE_ZONES].sum() + before[:CLOSE_ZONES].sum())
 
     def near_one_veh(self, group: int) -> float:
         return float(self.near_veh[group])
@@ -68,6 +73,7 @@ def scene(
         groups + gap_s,
         np.zeros(len(network.links)),
         sets,
+        network.set_link,
         network.link_junction[network.set_link],
         network.link_junction,
     )

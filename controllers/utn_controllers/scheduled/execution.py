@@ -17,7 +17,7 @@ from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.worth import Worth
 from utn_controllers.scheduled.yielding import Yielding
-from utn_sumo.contract import CLOSE_ZONES, ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
+from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
 
 BIN_S = 2
 """Length of a bin, and time between two decisions."""
@@ -93,10 +93,10 @@ class Scheduled:
         """(J, K) the last schedules."""
         self._row = np.argsort(stages)
         """(S,) row of the rules in which each of the network's stages is."""
-        self._then = np.zeros(len(network.junctions), dtype=np.int64)
-        """(J,) stage that each junction is to be led to at the next decision, or stays in."""
-        self._is_sooner = False
-        """Whether it is looked next before that, at who could be led there already."""
+        self._due: list[tuple[int, int]] = []
+        """Junctions whose green is to end at the next decision, and the stage then: who could be led there sooner."""
+        self._stopped: dict[tuple[int, int], tuple[int, ...]] = {}
+        """Lane sets that have green in one stage and none in another, of those that it was asked for."""
         self._endless = np.full(len(network.junctions), bins)
         self._green_s: Floats | None = None
         self._take_up()
@@ -113,8 +113,7 @@ class Scheduled:
 
     def wish(self, view: View | _Nobody) -> Ints:
         """(J,) stage that each junction's schedule begins with."""
-        if self._is_sooner:
-            self._is_sooner, self.every_s = False, BIN_S - SOONER_S
+        if self._due:
             return self._sooner(view)
         zones, present = view.zone_veh(view.free), self._row[view.stage]
         outlook = self._outlook
@@ -128,7 +127,7 @@ class Scheduled:
         else:
             rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
             rest = np.clip(rest_s / BIN_S, 0, self._plan.shape[1]).astype(np.int64)
-        wish, self._then = schedules(
+        wish, then = schedules(
             view.stage,
             view.free,
             rest,
@@ -141,23 +140,28 @@ class Scheduled:
             self._plan,
             outlook.sent_veh,
         )
-        self._is_sooner = bool((self._then != wish).any())
-        self.every_s = SOONER_S if self._is_sooner else BIN_S
+        self._due = [(index, int(then[index])) for index in (then != wish).nonzero()[0].tolist()]
+        self.every_s = SOONER_S if self._due else BIN_S
         return np.asarray(wish)
 
     def _sooner(self, view: View | _Nobody) -> Ints:
         """(J,) the present stages, but the next one where nobody is close any more whom it stops."""
-        streams, wish = self._streams, view.stage.copy()
-        ending = (self._then != view.stage) & view.free
-        of_set, before = (zone[:, :CLOSE_ZONES].sum(axis=1) for zone in view.zone_veh(ending))
-        close_veh = of_set + before[self.network.set_link]
-        for junction in ending.nonzero()[0].tolist():
-            own = slice(*streams.first[junction : junction + 2])
-            present, then = self._row[view.stage[junction]], self._row[self._then[junction]]
-            stopped = streams.serves[present, own] & ~streams.serves[then, own]
-            if not close_veh[streams.lane_set[own][stopped]].any():
-                wish[junction] = self._then[junction]
+        wish = view.stage
+        for junction, then in self._due:
+            stopped = self._stops(int(view.stage[junction]), then)
+            if view.free[junction] and not any(map(view.close_one_veh, stopped)):
+                wish = view.stage.copy() if wish is view.stage else wish
+                wish[junction] = then
+        self._due, self.every_s = [], BIN_S - SOONER_S
         return wish
+
+    def _stops(self, present: int, then: int) -> tuple[int, ...]:
+        """Lane sets with streams that have green in the present stage and not in the next one."""
+        if (present, then) not in self._stopped:
+            serves = self._streams.serves
+            stopped = self._streams.lane_set[serves[self._row[present]] & ~serves[self._row[then]]]
+            self._stopped[present, then] = tuple(np.unique(stopped).tolist())
+        return self._stopped[present, then]
 
     def _warm_up(self) -> None:
         """Have the machine code made now, not at the first decision."""
@@ -197,3 +201,6 @@ class _Nobody:
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:  # noqa: ARG002 - nobody is anywhere
         return self.zones
+
+    def close_one_veh(self, lane_set: int) -> float:  # noqa: ARG002
+        return 0.0

@@ -51,6 +51,10 @@ class Eyes:
         self._group_close: list[list[str]] = [[] for _ in network.groups]
         for group, zones in zip(network.set_group, ids.set_zone, strict=True):
             self._group_close[group] += chain.from_iterable(zones[:CLOSE_ZONES])
+        self._set_close = [
+            list(chain.from_iterable([*zones[:CLOSE_ZONES], *ids.upstream_zone[link][:CLOSE_ZONES]]))
+            for link, zones in zip(self._set_link.tolist(), ids.set_zone, strict=True)
+        ]
         self._step_s = network.control_step_s
         self._halting = bare(sumo, "lanearea", "getLastStepHaltingNumber")
         self._present = bare(sumo, "lanearea", "getLastStepVehicleNumber")
@@ -101,6 +105,10 @@ class Eyes:
             came, left, self._x_veh, self._entered_veh, self._left_veh, self._set_link
         )
         return counted
+
+    def close_one_veh(self, lane_set: int) -> float:
+        """In the zones up to CLOSE_ZONES of one lane set, and before its lanes part, moving or not."""
+        return float(sum(map(self._present, self._set_close[lane_set])))
 
     def near_one_veh(self, group: int) -> float:
         """In the lane-area detectors of one lane group, moving or not."""
@@ -206,6 +214,7 @@ class Sight:
         self.begin_s = heads.begin_s.copy()
         self.free = free
         self.near_one_veh = eyes.near_one_veh
+        self.close_one_veh = eyes.close_one_veh
         self.gap_one_s = eyes.gap_one_s
         self.zone_veh = eyes.zone_veh
         self._eyes = eyes
