@@ -111,15 +111,16 @@ def wide_crossing(folder: Path) -> Path:
 def test_who_waits_amid_a_junction_is_let_out_before_the_next_road_comes_under_schedules(
     controller: str, better: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    delay_s = []
+    net, delay_s = str(wide_crossing(tmp_path)), []
     for hold_s in (0.0, inside.MOST_HOLD_S):
         monkeypatch.setattr(inside, "MOST_HOLD_S", hold_s)
-        folder = tmp_path / str(hold_s)
-        folder.mkdir()
-        chosen = scenario(net=str(wide_crossing(folder)), controller=controller, seed=4)
-        result = bridge.run(chosen, folder / "run")
-        assert result["unsafe_signal_s"] == result["fallbacks"] == 0
-        delay_s.append(result["mean_delay_s"])
+        of_seeds_s = []
+        # One seed alone says little: 0.57 to 0.84 with ten.
+        for seed in range(1, 5):
+            result = bridge.run(scenario(net=net, controller=controller, seed=seed), tmp_path / f"{hold_s:g}-{seed}")
+            assert result["unsafe_signal_s"] == result["fallbacks"] == 0
+            of_seeds_s.append(result["mean_delay_s"])
+        delay_s.append(sum(of_seeds_s))
     assert delay_s[1] < 0.7 * delay_s[0] if better else delay_s[1] == delay_s[0]
 
 
