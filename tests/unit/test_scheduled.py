@@ -734,6 +734,28 @@ class TestExecution:
             execution.wish(replace(scene(utn17), set_zone_veh=by_the_line(near_veh), x_veh=x_veh))
             assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
 
+    @pytest.mark.parametrize(("ahead", "goes"), [(0.3, "3"), (0.6, "2")])
+    def test_who_brings_most_onto_a_road_that_fills_up_waits_however_many_of_them_turn_elsewhere(
+        self, ahead: float, goes: str, utn17: Network
+    ) -> None:
+        # Of link 3 four in five go onto link 10, of link 2 two in five, and link 3 has the longer queue by far.
+        name = [link.id for link in utn17.links]
+        veh = {"2": 2.0, "3": 24.0}
+        near_veh = np.array([veh.get(name[link], 0.0) for link in utn17.group_link])
+        x_veh = np.zeros(len(utn17.links))
+        x_veh[name.index("10")] = ahead * utn17.storage_veh[name.index("10")]
+        view = replace(scene(utn17), set_zone_veh=by_the_line(near_veh), x_veh=x_veh)
+        junction, execution, chosen = utn17.link_junction[name.index("3")], Scheduled(utn17), []
+        for now_s in np.arange(0.0, 400.0, 2.0):
+            left_veh = np.full(len(utn17.groups), now_s)
+            chosen.append(int(execution.wish(replace(view, time_s=now_s, left_veh=left_veh))[junction]))
+        served = [
+            [link for link in veh if name.index(link) in utn17.turn_link[utn17.serves[stage]]] for stage in chosen
+        ]
+        # The road has to have been full for a while.
+        assert served[0] == ["3"]
+        assert served[-1] == [goes]
+
     @pytest.mark.parametrize("blocking", [0.0, 4.0])
     @pytest.mark.parametrize("hemmed", ["10", "11"])
     def test_of_two_queues_alike_the_one_that_others_wait_behind_goes_first(

@@ -120,8 +120,9 @@ class Scheduled:
         stand, come, held = outlook.look(view, zones)
         stuck = self._standstill.look(view, present, stand)
         self._yielding.look(view, view.free, present, zones[0])
-        shares = outlook.shares.of_link, outlook.shares.set_of_link
-        worth, most = self._worth.look(view.time_s, view.free, zones, view.x_veh, shares, self._most, stuck, held)
+        worth, most = self._worth.look(
+            view.time_s, view.free, zones, view.x_veh, outlook.shares, self._most, stuck, held
+        )
         if self._green_s is None:
             rest = self._endless
         else:

@@ -65,10 +65,10 @@ def held_up(
 @compiled
 def _queues(own: float, before: float, limits: tuple[tuple[float, float], tuple[float, float]]) -> float:
     """0 where one of the shares is below its limits, 1 where both are above them."""
-    return float(_between(own, limits[0]) * _between(before, limits[1]))
+    return float(between(own, limits[0]) * between(before, limits[1]))
 
 
 @compiled
-def _between(share: float, limits: tuple[float, float]) -> float:
+def between(share: float, limits: tuple[float, float]) -> float:
     """0 below the first limit, 1 above the second, straight between."""
     return float(min(max((share - limits[0]) / (limits[1] - limits[0]), 0.0), 1.0))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.scheduled.pockets import rooms_veh
-from utn_controllers.scheduled.streams import Streams
+from utn_controllers.scheduled.pockets import between, rooms_veh
+from utn_controllers.scheduled.streams import Shares, Streams
 from utn_sumo.compiling import compiled
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
@@ -13,10 +13,13 @@ FADING = 0.2
 """Over what share of its storage about `full` a link is fed less and less."""
 LEAST_WORTH = 0.05
 """Of a vehicle that would go from an empty link into a full one."""
+HOLDING_BACK = 0.4, 0.5
+"""Shares of a link's storage, now and of late, between which those come to be held back who share lanes with traffic
+onto it: with one of two lanes full half of it is taken."""
 BLOCKED_VEH = 1e-6
 """What leaves in a bin where nobody goes, or is to go."""
 LASTING_S = 100.0
-"""Over what time queues are taken that hold up those behind them: within a cycle all come and go."""
+"""Over what time queues are taken that hold up those behind them, and full links: within a cycle all come and go."""
 DENSE = 0.3
 """Share of the room in sight from which on, over that time, a queue holds up who is behind it."""
 STARVED_S = 120.0
@@ -34,6 +37,12 @@ class Worth:
         self._set_junction = network.link_junction[network.set_link]
         set_veh, before_veh = rooms_veh(network)
         self._room = set_veh, before_veh
+        self._wide = np.array([link.lanes > 1 for link in network.links], dtype=np.bool_)
+        """(Z,) links of which one lane may be full and another one empty."""
+        self._late = np.zeros(len(network.links))
+        """(Z,) share of their storage that has been taken of late."""
+        self._time_s = 0.0
+        """When that was looked at."""
         self._dense = np.zeros(len(network.lane_sets))
         """(L,) share of their room in sight that vehicles have taken up of late."""
         self._looked_s = np.zeros(len(network.lane_sets))
@@ -47,7 +56,7 @@ class Worth:
         asked: Bools,
         zones: tuple[Floats, Floats],
         x: Floats,
-        shares: tuple[Floats, Floats],
+        shares: Shares,
         most: Floats,
         stuck: Bools,
         held: Floats,
@@ -55,19 +64,20 @@ class Worth:
         """(N,) what a vehicle of each stream is worth, (N,) how many leave in a bin of green.
 
         By the vehicles in `zones` (View.zone_veh) before the junctions `asked` (J,) and on all links `x` (Z,); the
-        `shares` of their links' traffic that streams (N,) and lane sets (L,) have; the `most` (N,) that can leave
-        of each stream, whether it is `stuck` (N,) before its green, and how much more lane sets (L,) weigh who hold
-        others up.
+        `shares` that streams and lane sets have of traffic; the `most` (N,) that can leave of each stream, whether it
+        is `stuck` (N,) before its green, and how much more lane groups (G,) weigh who hold others up.
         """
         network, streams = self._network, self._streams
         _lasting(
             time_s, asked, self._set_junction, network.set_link, *zones, *self._room,
-            shares[1], self._dense, self._looked_s, self._empty_s,
+            shares.set_of_link, self._dense, self._looked_s, self._empty_s,
         )  # fmt: skip
         worth, moving = _worth(
             x, network.storage_veh, self._dense, network.begins_amid, streams.link, streams.lane_set, streams.group,
-            streams.next_link, shares[0], most, stuck, held, time_s, self._empty_s, *self._settings,
+            streams.next_link, shares.of_link, shares.of_set, self._wide, self._late, time_s - self._time_s, most,
+            stuck, held, time_s, self._empty_s, *self._settings,
         )  # fmt: skip
+        self._time_s = time_s
         return worth, moving
 
 
@@ -96,8 +106,8 @@ def _lasts(dense: Floats) -> Floats:
 @compiled
 def _worth(
     x: Floats, storage: Floats, dense: Floats, amid: Bools, links: Ints, sets: Ints, groups: Ints, next_links: Ints,
-    of_link: Floats, most: Floats, stuck: Bools, held: Floats, time_s: float, empty_s: Floats, crowding: float,
-    blocking: float, starving: float, full: float,
+    of_link: Floats, of_set: Floats, wide: Bools, late: Floats, ago_s: float, most: Floats, stuck: Bools, held: Floats,
+    time_s: float, empty_s: Floats, crowding: float, blocking: float, starving: float, full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
     queue, taken = _lasts(dense), x / storage
     # Where nobody sees who waits behind a link, its own vehicles say it.
@@ -106,19 +116,40 @@ def _worth(
         if ahead != EXIT:
             feeding[ahead] += of_link[stream]
             behind[ahead] += of_link[stream] * queue[sets[stream]]
+    late += (1 - np.exp(-ago_s / LASTING_S)) * (taken - late)
+    back = _held_back(np.minimum(taken, late), feeding, wide, links, sets, next_links, of_set, len(dense))
     worth, moving = np.empty(len(links)), most.copy()
     for stream, ahead in enumerate(next_links):
         link = links[stream]
         there = taken[ahead] if ahead != EXIT else 0.0
         # A queue takes the room of those who would come onto its link, the more of them wait behind.
         blocks = queue[sets[stream]] * behind[link] / feeding[link] if feeding[link] > 0 else 0.0
-        value = max(1 + crowding * (taken[link] - there) + blocking * blocks, LEAST_WORTH)
+        value = (1 + crowding * (taken[link] - there) + blocking * blocks) * (1 - back[sets[stream]])
         # With queues enough for the best stages there are others that would never be worth their clearance.
         starved = min((time_s - empty_s[sets[stream]]) / STARVED_S, 1.0)
-        worth[stream] = held[groups[stream]] * (1 + starving * starved) * value
+        worth[stream] = held[groups[stream]] * (1 + starving * starved) * max(value, LEAST_WORTH)
         fed = (full + FADING / 2 - there) / FADING
         if fed < 1:
             moving[stream] = max(fed * most[stream], BLOCKED_VEH)
         if stuck[stream]:
             moving[stream] = BLOCKED_VEH
     return worth, moving
+
+
+@compiled
+def _held_back(
+    taken: Floats, feeding: Floats, wide: Bools, links: Ints, sets: Ints, next_links: Ints, of_set: Floats, count: int
+) -> Floats:
+    """(L,) of each lane set's traffic the share that should not go on yet, so that the others have to wait with it.
+
+    Green for who turns elsewhere lets in whoever shares his lanes. Where all links of a circuit have a lane full to its
+    beginning, each lets go only when the next one does: who comes from outside waits there, where he is in nobody's
+    way, and whoever would go onto a road of several lanes, of which one is full while others are empty. A single lane
+    is far from full by then, and who has to wait before it would soon fill a short block. `taken` (Z,) are shares of
+    the links' storage.
+    """
+    back = np.zeros(count)
+    for stream, ahead in enumerate(next_links):
+        if ahead != EXIT and (wide[ahead] or feeding[links[stream]] == 0):
+            back[sets[stream]] += of_set[stream] * between(taken[ahead], HOLDING_BACK)
+    return back
