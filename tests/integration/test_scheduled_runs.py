@@ -136,3 +136,15 @@ def test_where_people_walk_nobody_late_amid_a_junction_locks_a_street_under_sche
     assert result["teleports"] == 0
     # Under locks 63 s and 45 s.
     assert result["mean_delay_s"] < most_s
+
+
+def test_who_waits_at_a_red_is_not_taken_off_the_road_where_sumo_takes_off_soon_who_stands(tmp_path: Path) -> None:
+    net = tuning_nets.write("turns", tmp_path / "turns")
+    said = net.read_text(encoding="utf-8")
+    net.write_text(
+        said.replace("</configuration>", '<time-to-teleport value="120"/></configuration>'), encoding="utf-8"
+    )
+    result = bridge.run(scenario(net=str(net), controller="recommended", seed=4, demand=1.4), tmp_path / "run")
+    # With 180 s as elsewhere 50 are, or so.
+    assert result["teleports"] == 0
+    assert result["longest_red_s"] <= 110

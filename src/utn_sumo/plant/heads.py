@@ -12,7 +12,7 @@ from utn_sumo import clearances
 from utn_sumo.clearances import Phases, Times
 from utn_sumo.contract import Bools, Ints, Network
 from utn_sumo.plant.inside import MOST_HOLD_S, Areas, Inside
-from utn_sumo.plant.patience import Patience
+from utn_sumo.plant.patience import LONGEST_RED_S, Patience
 
 HOLD_S = 1.0
 """By which a stage begins later as long as somebody is amid the junction."""
@@ -21,7 +21,13 @@ HOLD_S = 1.0
 class Heads:
     """The signals of a network: the stage of each junction, or the clearance on the way to it."""
 
-    def __init__(self, network: Network, show: Callable[[int, str], None], areas: Areas | None = None):
+    def __init__(
+        self,
+        network: Network,
+        show: Callable[[int, str], None],
+        areas: Areas | None = None,
+        longest_red_s: float = LONGEST_RED_S,
+    ):
         """`show` puts letters on the signals of a junction; without `areas` nobody is waited for amid it."""
         self.network = network
         self._show = show
@@ -37,7 +43,7 @@ class Heads:
         held_s = np.zeros(len(network.junctions))
         if self._inside is not None:
             held_s += MOST_HOLD_S * self._inside.may_hold()
-        self.patience = Patience(network, held_s)
+        self.patience = Patience(network, held_s, longest_red_s)
         self._due: list[tuple[float, int, int, str, bool]] = []
         """A heap of (time, junction, number, letters, whether its stage begins with them) still to be shown."""
         self._numbers = count()

@@ -13,21 +13,34 @@ from utn_sumo import clearances
 from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints, Network, View
 
-MOST_PATIENCE_S = 150.0
-"""Who has waited so long without green is served next, whatever is wished."""
 LONGEST_RED_S = 180.0
-"""Where least greens and clearances are long it comes next sooner: nobody is to wait longer than this."""
+"""Nobody is to wait longer without green, whatever is wished."""
+PATIENCE = 5 / 6
+"""Who has waited for such a share of it is served next; sooner where least greens and clearances are long."""
+MOST_PATIENCE_S = PATIENCE * LONGEST_RED_S
+STARTING_S = 10.0
+"""Where SUMO takes vehicles off the road that stand for long, green comes so long before."""
+LEAST_LONGEST_RED_S = 90.0
+"""But where that is soon no sooner than this: there would be hardly any time for anything but clearances."""
 LOOK_S = 5.0
 """Time between two looks at who waits, or a little more."""
 PAUSE_S = 10.0
 """Who has stood so short a time ago waits still: in a queue that creeps nobody stands for a moment."""
 
 
+def longest_red_s(teleport_s: float) -> float:
+    """The longest red where SUMO takes vehicles off the road that stand for `teleport_s`, or never if not positive."""
+    if teleport_s <= 0:
+        return LONGEST_RED_S
+    return min(max(teleport_s - STARTING_S, LEAST_LONGEST_RED_S), LONGEST_RED_S)
+
+
 class Patience:
     """Keeps since when somebody has been waiting for each turn, and for each crossing of those who walk."""
 
-    def __init__(self, network: Network, held_s: Floats):
+    def __init__(self, network: Network, held_s: Floats, longest_red_s: float = LONGEST_RED_S):
         """Stages of each junction may begin `held_s` (J,) later than the clearance before is over."""
+        self._longest_red_s = longest_red_s
         self._turn_group = network.turn_group
         self._needs = np.hstack([network.serves, _walks(network)])
         """(S, M + walks) which turns and which letters of pedestrians each stage has green for."""
@@ -39,7 +52,7 @@ class Patience:
         self._lasts_s = network.least_green_s + self._leaves_s
         """(S,) from a stage's begin until another one can begin."""
         all_s = np.bincount(network.stage_junction, self._lasts_s)
-        self._carefree_s = np.clip(LONGEST_RED_S - LOOK_S - all_s, 0.0, MOST_PATIENCE_S)
+        self._carefree_s = np.clip(longest_red_s - LOOK_S - all_s, 0.0, PATIENCE * longest_red_s)
         """(J,) before somebody has waited so long all can be served, whoever they are and whatever is wished."""
         self._since_s = np.zeros(self._needs.shape[1])
         """(M + walks,) since when somebody has been waiting for each, without green meanwhile."""
@@ -88,10 +101,10 @@ class Patience:
     def _first(self, present: int, waiting: Ints, now_s: float) -> tuple[int, float]:
         """The stage to serve first of those that those `waiting` need, and when it has to be led to at the latest."""
         left = waiting[np.lexsort((-waiting, self._since_s[waiting]))]
-        is_late = self._since_s[left[0]] + MOST_PATIENCE_S <= now_s
+        is_late = self._since_s[left[0]] + PATIENCE * self._longest_red_s <= now_s
         latest_s, opens_s, stages = -np.inf if is_late else np.inf, self._leaves_s[present], []
         while len(left):
-            latest_s = min(latest_s, self._since_s[left[0]] + LONGEST_RED_S - opens_s)
+            latest_s = min(latest_s, self._since_s[left[0]] + self._longest_red_s - opens_s)
             # Of those that serve whoever waits the longest: the one that most others wait for too.
             stage = int(np.argmax(np.where(self._needs[:, left[0]], self._needs[:, left].sum(axis=1), -1)))
             stages.append(stage)

@@ -35,6 +35,7 @@ from utn_sumo.contract import (
 from utn_sumo.errors import PlanError, PlantError
 from utn_sumo.plant.eyes import Eyes, Sight, bare
 from utn_sumo.plant.heads import Heads
+from utn_sumo.plant.patience import LONGEST_RED_S, longest_red_s
 from utn_sumo.signals import cycle_phases
 
 PROGRAM = "utn"
@@ -137,7 +138,8 @@ class SumoPlant:
         self._eyes = Eyes(self.network, self._ids, libsumo)
         self._set_state = bare(libsumo, "trafficlight", "setRedYellowGreenState")
         lets_out = getattr(self._execution, "lets_out", False)
-        self._heads = Heads(self.network, self._show, self._eyes if lets_out else None)
+        longest_s = longest_red_s(self.routes.teleport_s) if isinstance(self.routes, Case) else LONGEST_RED_S
+        self._heads = Heads(self.network, self._show, self._eyes if lets_out else None, longest_s)
         for edge, lanes in self.network.edge_lanes.items():
             whole = libsumo.edge.getLaneNumber(edge) == len(lanes)
             places = [(libsumo.edge, edge)] if whole else [(libsumo.lane, f"{edge}_{lane}") for lane in lanes]
