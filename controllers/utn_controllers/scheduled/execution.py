@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.scheduled.ending import Ending
+from utn_controllers.scheduled.flows import Flows
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
@@ -75,7 +76,8 @@ class Scheduled:
         stages = self._streams.stage
         moves = Moves(network, self._streams, BIN_S)
         self._yielding = Yielding(network, self._streams, moves.share)
-        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S)
+        self._flows = Flows(network)
+        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, self.settings.discharge)
         self._rules = Rules(
             stages,
             self._streams.first_stage,
@@ -119,7 +121,8 @@ class Scheduled:
         outlook = self._outlook
         stand, come, held = outlook.look(view, zones)
         stuck = self._standstill.look(view, present, stand)
-        self._yielding.look(view, view.free, present, zones[0])
+        gone = self._flows.look(view, view.free, zones[0])
+        self._yielding.look(view, view.free, present, zones[0], gone)
         worth, most = self._worth.look(
             view.time_s, view.free, zones, view.x_veh, outlook.shares, self._most, stuck, held
         )
@@ -138,6 +141,7 @@ class Scheduled:
             worth,
             self._ending.weights(worth),
             most,
+            self._giving.look(view, view.free, present, gone),
             self._plan,
             outlook.sent_veh,
         )
