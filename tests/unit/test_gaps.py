@@ -102,12 +102,12 @@ def test_whether_a_lane_goes_shows_in_who_has_gone(street_of: StreetOf) -> None:
     giving, streams, flows = execution._giving, execution._streams, Flows(network)
     present = np.array([streams.first_stage[junction] for junction in range(len(network.junctions))])
     asked = np.ones(len(network.junctions), dtype=np.bool_)
-    queue = by_the_line(np.full(len(network.lane_sets), 8.0))
     waits = giving.gaps.waiting[present[0], : streams.first[1]] > 0
     assert waits.any()
 
-    def paces(gone: float, begin_s: float = 0.0) -> Floats:
+    def paces(gone: float, begin_s: float = 0.0, veh: float = 8.0) -> Floats:
         """A decision after one at which there was a queue, with such a share of the saturation flow gone since."""
+        queue = by_the_line(np.full(len(network.lane_sets), veh))
         for now_s, share in ((20.0, 0.0), (22.0, gone)):
             view = scene(network, now_s)
             view.begin_s[:] = begin_s
@@ -119,22 +119,31 @@ def test_whether_a_lane_goes_shows_in_who_has_gone(street_of: StreetOf) -> None:
     for gone in (0.0, 0.5, 1.0, 2.0):
         assert paces(gone)[waits] == pytest.approx(min(gone, 1.0))
         assert (paces(gone)[~waits] == 1.0).all()
-    # As a green begins nobody can have gone yet.
+    # As a green begins nobody can have gone yet, and where nobody is nobody stands.
     assert (paces(0.0, begin_s=19.0) == 1.0).all()
+    assert (paces(0.0, veh=0.0) == 1.0).all()
 
 
 def test_who_has_gone_is_counted_from_look_to_look(street_of: StreetOf) -> None:
     network = street_of(odd_nets.plain)
     flows, sets = Flows(network), len(network.lane_sets)
-    flow_veh_s = network.set_saturation_flow_veh_s
-    queue, everywhere = by_the_line(np.full(sets, 3.0)), np.ones(len(network.junctions), dtype=np.bool_)
-    for now_s, asked, queued, since_s in ((10.0, True, False, 10.0), (12.0, False, True, 0.0), (16.0, True, True, 6.0)):
-        view = replace(scene(network, now_s), left_veh=now_s * flow_veh_s)
-        gone = flows.look(view, everywhere & asked, queue)
-        assert (gone.queued == queued).all()
-        assert gone.since_s == pytest.approx(since_s)
-        assert gone.veh == pytest.approx(since_s * flow_veh_s)
-        assert gone.share == pytest.approx(float(asked))
+    asked = np.ones(len(network.junctions), dtype=np.bool_)
+    queue, nobody = (by_the_line(np.full(sets, veh)) for veh in (3.0, 0.0))
+
+    def look(now_s: float, gone_s: float, zone: Floats, is_asked: bool = True) -> tuple[float, bool, float, float]:
+        """After so many seconds of saturation flow; all lane sets are alike."""
+        view = replace(scene(network, now_s), left_veh=gone_s * network.set_saturation_flow_veh_s)
+        found = flows.look(view, asked & is_asked, zone)
+        assert all(np.allclose(each, each[0]) for each in found)
+        return float(found.share[0]), bool(found.queued[0]), float(found.since_s[0]), float(found.idle_s[0])
+
+    assert look(10.0, 4.0, queue) == pytest.approx((0.4, False, 10.0, 0.0))
+    assert look(12.0, 5.0, queue, is_asked=False) == pytest.approx((0.0, True, 0.0, 0.0))
+    assert look(14.0, 6.0, queue) == pytest.approx((0.5, True, 4.0, 0.0))
+    assert look(16.0, 6.0, queue) == pytest.approx((0.0, True, 2.0, 2.0))
+    assert look(18.0, 6.0, queue) == pytest.approx((0.0, True, 2.0, 4.0))
+    assert look(20.0, 6.0, nobody) == pytest.approx((0.0, True, 2.0, 0.0))
+    assert look(22.0, 7.0, queue) == pytest.approx((0.5, False, 2.0, 0.0))
 
 
 def test_left_turns_without_a_stage_of_their_own_wait_for_who_comes_straight_on(street_of: StreetOf) -> None:

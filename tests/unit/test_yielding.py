@@ -82,7 +82,7 @@ def test_its_share_is_what_has_gone_of_late_and_is_forgotten(flow: float, arrows
     def look(now_s: float, zone: Floats) -> None:
         view = replace(scene(arrows, now_s), left_veh=flow * saturated_veh_s * now_s)
         asked = np.broadcast_to(junction, len(arrows.junctions))
-        learning.look(view, asked, present, zone, flows.look(view, asked, zone))
+        learning.look(view, asked, present, flows.look(view, asked, zone))
 
     queue = by_the_line(np.full(len(arrows.groups), QUEUE_VEH))
     for now_s in np.arange(0.0, 200.0, 2.0):
@@ -143,7 +143,7 @@ def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_
 
     def look(now_s: float, row: int) -> None:
         view = replace(scene(network, now_s), left_veh=left_veh.copy())
-        learning.look(view, asked, np.array([row]), queue, flows.look(view, asked, queue))
+        learning.look(view, asked, np.array([row]), flows.look(view, asked, queue))
 
     for now_s in np.arange(0.0, BLOCKED_S, 2.0):
         look(now_s, arrow)

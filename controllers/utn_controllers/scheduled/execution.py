@@ -122,7 +122,7 @@ class Scheduled:
         stand, come, held = outlook.look(view, zones)
         stuck = self._standstill.look(view, present, stand)
         gone = self._flows.look(view, view.free, zones[0])
-        self._yielding.look(view, view.free, present, zones[0], gone)
+        self._yielding.look(view, view.free, present, gone)
         worth, most = self._worth.look(
             view.time_s, view.free, zones, view.x_veh, outlook.shares, self._most, stuck, held
         )

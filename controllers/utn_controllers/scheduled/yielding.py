@@ -43,23 +43,18 @@ class Yielding:
         """(S, L) lane sets of which a stage serves a part."""
         self._blocked = np.zeros(len(network.lane_sets), dtype=np.bool_)
         """(L,) lane sets of which who is in front had red in a stage that serves the others."""
-        self._went_s = np.zeros(len(network.lane_sets))
-        """(L,) when somebody left, or nobody was by the stop line, last."""
         self._share = np.ones(self.learnt.shape)
         """(S, L) of the discharge."""
         self._is_needed = bool(self.learnt.any() or self._partly.any())
 
-    def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats, gone: Gone) -> None:
-        """Take up who has `gone` before the junctions `asked` (J,) in their `present` stage, the row (J,) that it is.
-
-        `zone` (L, zones) of View.zone_veh.
-        """
+    def look(self, view: Shown, asked: Bools, present: Ints, gone: Gone) -> None:
+        """Take up who has `gone` before the junctions `asked` (J,) in their `present` stage, by its row (J,)."""
         if self._is_needed:
             network, streams = self._network, self._streams
             _learn(
-                view.time_s, asked, present, view.begin_s, zone[:, 0], *gone, network.link_junction[network.set_link],
-                self.learnt, self._partly, self._share, self._blocked, self._went_s, streams.lane_set, streams.first,
-                streams.first_stage, streams.serves, self._moves,
+                view.time_s, asked, present, view.begin_s, *gone,
+                network.link_junction[network.set_link], self.learnt, self._partly, self._share, self._blocked,
+                streams.lane_set, streams.first, streams.first_stage, streams.serves, self._moves,
             )  # fmt: skip
 
 
@@ -90,9 +85,9 @@ def _partly(streams: Streams, sets: int) -> Bools:
 
 @compiled
 def _learn(
-    time_s: float, asked: Bools, present: Ints, begin_s: Floats, near: Floats, gone_veh: Floats, gone: Floats,
-    queued: Bools, since_s: Floats, set_junction: Ints, gives_way: Bools, partly: Bools, share: Floats, blocked: Bools,
-    went_s: Floats, stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
+    time_s: float, asked: Bools, present: Ints, begin_s: Floats, gone: Floats, queued: Bools, since_s: Floats,
+    idle_s: Floats, set_junction: Ints, gives_way: Bools, partly: Bools, share: Floats, blocked: Bools,
+    stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
 ) -> None:  # fmt: skip
     for lane_set, junction in enumerate(set_junction):
         if not asked[junction]:
@@ -103,9 +98,9 @@ def _learn(
         if gives_way[row, lane_set] and queued[lane_set] and time_s - ago_s >= begin_s[junction] + START_S:
             now = share[row, lane_set] + min(ago_s / MEMORY_S, 1.0) * (gone[lane_set] - share[row, lane_set])
             share[row, lane_set] = min(max(now, LEAST_SHARE), 1.0)
-        if gone_veh[lane_set] > 0 or near[lane_set] < 1:
-            went_s[lane_set], blocked[lane_set] = time_s, False
-        elif partly[row, lane_set] and time_s - max(went_s[lane_set], begin_s[junction]) >= BLOCKED_S:
+        if idle_s[lane_set] == 0:
+            blocked[lane_set] = False
+        elif partly[row, lane_set] and min(idle_s[lane_set], time_s - begin_s[junction]) >= BLOCKED_S:
             blocked[lane_set] = True
     for junction in range(len(asked)):
         if asked[junction]:
