@@ -73,6 +73,8 @@ class Giving:
             np.zeros(shape[0], dtype=np.bool_),
             GAP_S / bin_s,
         )
+        self.is_needed = bool(self._waits.any())
+        """Whether anybody waits for gaps."""
         for row, stage in enumerate(streams.stage):
             first, last = streams.first[network.stage_junction[stage] :][:2]
             for stream in first + np.flatnonzero(streams.serves[row, first:last]):

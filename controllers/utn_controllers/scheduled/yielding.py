@@ -45,11 +45,12 @@ class Yielding:
         """(L,) lane sets of which who is in front had red in a stage that serves the others."""
         self._share = np.ones(self.learnt.shape)
         """(S, L) of the discharge."""
-        self._is_needed = bool(self.learnt.any() or self._partly.any())
+        self.is_needed = bool(self.learnt.any() or self._partly.any())
+        """Whether anybody gives way who has a stage of his own elsewhere, or has red beside others of his lane."""
 
     def look(self, view: Shown, asked: Bools, present: Ints, gone: Gone) -> None:
         """Take up who has `gone` before the junctions `asked` (J,) in their `present` stage, by its row (J,)."""
-        if self._is_needed:
+        if self.is_needed:
             network, streams = self._network, self._streams
             _learn(
                 view.time_s, asked, present, view.begin_s, *gone,
