@@ -86,7 +86,7 @@ class Crossing:
         first = np.array([0, stages])
         who = going(moves, stages, clearing, clearance)
         shape = stages, moves.shape[1]
-        gaps = Gaps(np.zeros(shape), np.zeros(shape), np.full((*shape, 1), -1), np.zeros(stages, dtype=np.bool_), 2.0)
+        gaps = Gaps(np.zeros(shape), np.full((*shape, 1), -1), np.zeros(stages, dtype=np.bool_), 2.0)
         return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least), gaps)
 
     def decide(
@@ -116,7 +116,6 @@ class Crossing:
             np.zeros(stages) + np.array(worth, dtype=float),
             self.ends(worth),
             np.zeros(stages) + np.array(most, dtype=float),
-            np.ones(stages),
             plan[None].copy(),
             sent,
         )

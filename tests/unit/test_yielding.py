@@ -13,7 +13,6 @@ import pytest
 from tests.integration import odd_nets
 from tests.unit.views import by_the_line, scene
 from utn_controllers.scheduled.execution import Scheduled
-from utn_controllers.scheduled.flows import Flows
 from utn_controllers.scheduled.moves import Moves
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.yielding import BLOCKED_S, LEAST_SHARE, Yielding
@@ -73,7 +72,7 @@ def test_who_never_has_a_stage_alone_is_left_as_it_is(make: Make, street_of: Str
 def test_its_share_is_what_has_gone_of_late_and_is_forgotten(flow: float, arrows: Network) -> None:
     streams = Streams(arrows)
     moves = Moves(arrows, streams, 2).share
-    learning, flows, group = Yielding(arrows, streams, moves), Flows(arrows), left_turns(arrows)[0]
+    learning, group = Yielding(arrows, streams, moves), left_turns(arrows)[0]
     stage = through_stage(arrows, group)
     row, junction = np.array([streams.stage.tolist().index(stage)]), np.array([True])
     present = np.where(np.arange(len(arrows.junctions)) == arrows.stages[stage].junction, row, 0)
@@ -81,8 +80,7 @@ def test_its_share_is_what_has_gone_of_late_and_is_forgotten(flow: float, arrows
 
     def look(now_s: float, zone: Floats) -> None:
         view = replace(scene(arrows, now_s), left_veh=flow * saturated_veh_s * now_s)
-        asked = np.broadcast_to(junction, len(arrows.junctions))
-        learning.look(view, asked, present, flows.look(view, asked, zone))
+        learning.look(view, np.broadcast_to(junction, len(arrows.junctions)), present, zone)
 
     queue = by_the_line(np.full(len(arrows.groups), QUEUE_VEH))
     for now_s in np.arange(0.0, 200.0, 2.0):
@@ -133,7 +131,7 @@ def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_
     network = street_of(an_arrow_for_a_shared_lane)
     streams = Streams(network)
     moves = Moves(network, streams, 2).share
-    learning, flows, asked = Yielding(network, streams, moves), Flows(network), np.array([True])
+    learning = Yielding(network, streams, moves)
     arrow = next(row for row, stage in enumerate(streams.stage) if "g" not in network.stages[stage].state)
     turning = np.flatnonzero(streams.serves[arrow])
     lane_set = streams.lane_set[turning[0]]
@@ -143,7 +141,7 @@ def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_
 
     def look(now_s: float, row: int) -> None:
         view = replace(scene(network, now_s), left_veh=left_veh.copy())
-        learning.look(view, asked, np.array([row]), flows.look(view, asked, queue))
+        learning.look(view, np.array([True]), np.array([row]), queue)
 
     for now_s in np.arange(0.0, BLOCKED_S, 2.0):
         look(now_s, arrow)

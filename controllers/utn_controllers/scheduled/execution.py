@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.scheduled.ending import Ending
-from utn_controllers.scheduled.flows import Flows
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
@@ -76,9 +75,7 @@ class Scheduled:
         stages = self._streams.stage
         moves = Moves(network, self._streams, BIN_S)
         self._yielding = Yielding(network, self._streams, moves.share)
-        self._flows = Flows(network)
-        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, self.settings.discharge)
-        self._all_go = np.ones(len(self._streams.link))
+        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S)
         self._rules = Rules(
             stages,
             self._streams.first_stage,
@@ -122,7 +119,7 @@ class Scheduled:
         outlook = self._outlook
         stand, come, held = outlook.look(view, zones)
         stuck = self._standstill.look(view, present, stand)
-        goes_now = self._goes_now(view, present, zones[0])
+        self._yielding.look(view, view.free, present, zones[0])
         worth, most = self._worth.look(
             view.time_s, view.free, zones, view.x_veh, outlook.shares, self._most, stuck, held
         )
@@ -141,24 +138,12 @@ class Scheduled:
             worth,
             self._ending.weights(worth),
             most,
-            goes_now,
             self._plan,
             outlook.sent_veh,
         )
         self._due = [(index, int(then[index])) for index in (then != wish).nonzero()[0].tolist()]
         self.every_s = SOONER_S if self._due else BIN_S
         return np.asarray(wish)
-
-    def _goes_now(self, view: View | _Nobody, present: Ints, zone: Floats) -> Floats:
-        """(N,) share of their lanes that go; what is learnt from who has gone is taken up.
-
-        Where nobody gives way there is nothing to learn.
-        """
-        if not (self._yielding.is_needed or self._giving.is_needed):
-            return self._all_go
-        gone = self._flows.look(view, view.free, zone)
-        self._yielding.look(view, view.free, present, gone)
-        return self._giving.look(view, view.free, present, gone)
 
     def _sooner(self, view: View | _Nobody) -> Ints:
         """(J,) the present stages, but the next one where nobody is close any more whom it stops."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.scheduled.gaps import Gaps, let_go, opens_at
+from utn_controllers.scheduled.gaps import Gaps, let_go
 from utn_controllers.scheduled.moves import Rules
 from utn_controllers.scheduled.traffic import Traffic
 from utn_sumo.compiling import compiled, inlined
@@ -32,15 +32,14 @@ ALIKE = 1e-9
 @compiled
 def schedules(
     stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats, ends: Floats,
-    most: Floats, goes_now: Floats, plan: Ints, sent: Floats,
+    most: Floats, plan: Ints, sent: Floats,
 ) -> tuple[Ints, Ints]:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
     And (J,) the same of the next bin, as far as it is foreseen.
 
     `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
-    weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `most` (N,) that leave in a bin of green,
-    `goes_now` (N,) the share of that which goes at present where somebody waits for gaps.
+    weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `most` (N,) that leave in a bin of green.
 
     `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
@@ -61,12 +60,12 @@ def schedules(
         if rules.gaps.some[low : low + stages].any():
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, rules.gaps, stand[a:b], come[a:b], worth[a:b], ends[a:b],
-                most[a:b], goes_now[a:b], plan[junction], sent[a:b],
+                most[a:b], plan[junction], sent[a:b],
             )  # fmt: skip
         else:
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, None, stand[a:b], come[a:b], worth[a:b], ends[a:b],
-                most[a:b], goes_now[a:b], plan[junction], sent[a:b],
+                most[a:b], plan[junction], sent[a:b],
             )  # fmt: skip
         wish[junction] = rules.stages[low + chosen]
         then[junction] = wish[junction]
@@ -81,7 +80,7 @@ def schedules(
 @compiled
 def _schedule(
     present: int, rest: int, low: int, stages: int, rules: Rules, gaps: Gaps | None, stand: Floats, come: Floats,
-    worth: Floats, ends: Floats, most: Floats, goes_now: Floats, plan: Ints, sent: Floats,
+    worth: Floats, ends: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on.
 
@@ -92,15 +91,15 @@ def _schedule(
     if called.any():
         traffic = _sums(rules.moves[low : low + stages], stand, come, worth, ends, most)
         # What was best a bin ago is seldom far from what is best now.
-        _send_off(plan, rules, gaps, stand, come, most, goes_now, sent)
+        _send_off(plan, rules, gaps, stand, come, most, sent)
         known = _waited(sent, traffic)
         for limit in (known + ALIKE * (2 + known), NEVER):
-            chosen = _search(present, rest, low, called, rules, gaps, traffic, limit, goes_now, plan)
+            chosen = _search(present, rest, low, called, rules, gaps, traffic, limit, plan)
             if chosen >= 0:
                 break
     else:
         plan[:] = low + present
-    _send_off(plan, rules, gaps, stand, come, most, goes_now, sent)
+    _send_off(plan, rules, gaps, stand, come, most, sent)
     return chosen
 
 
@@ -125,7 +124,7 @@ def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, co
 @compiled
 def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for the compiler
     present: int, rest: int, low: int, called: Bools, rules: Rules, gaps: Gaps | None, traffic: Traffic, limit: float,
-    goes_now: Floats, plan: Ints,
+    plan: Ints,
 ) -> int:  # fmt: skip
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
@@ -166,11 +165,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     lose = 0 if clearing[row, other] >= 0 else min(lose, clearance[row, other])
             may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
             now, goes = begin, True
-            if gaps is not None:
-                if begin == 0:
-                    pace[:] = goes_now
-                else:
-                    opens_at(row, gaps, pace)
+            pace[:] = 1.0
             while now < bins:
                 if spent + _held(stage, grown, paid, now, min(now + lose, bins), held) >= best - ALIKE:
                     break
@@ -407,14 +402,7 @@ def _trace(present: int, begin: int, stage: int, low: int, whence: Ints, clearin
 
 @compiled
 def _send_off(
-    plan: Ints,
-    rules: Rules,
-    gaps: Gaps | None,
-    stand: Floats,
-    come: Floats,
-    most: Floats,
-    goes_now: Floats,
-    sent: Floats,
+    plan: Ints, rules: Rules, gaps: Gaps | None, stand: Floats, come: Floats, most: Floats, sent: Floats
 ) -> None:
     """Fills `sent` (n, K) with what leaves by a `plan`."""
     if gaps is None:
@@ -426,19 +414,17 @@ def _send_off(
                 sent[stream, place] = leaves
                 queue -= leaves
     else:
-        _let_all_go(plan, rules, gaps, stand.copy(), come, most, goes_now, sent)
+        _let_all_go(plan, rules, gaps, stand.copy(), come, most, sent)
 
 
 @compiled
-def _let_all_go(
-    plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats, most: Floats, goes_now: Floats, sent: Floats
-) -> None:
+def _let_all_go(plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats, most: Floats, sent: Floats) -> None:
     """Fills `sent` (n, K) as `_send_off` where somebody waits for gaps: bin by bin, from the vehicles `veh` (n,) on."""
-    pace, want = goes_now.copy(), np.zeros(len(veh))
+    pace, want = np.ones(len(veh)), np.zeros(len(veh))
     for place, row in enumerate(plan):
+        if place == 0 or plan[place - 1] != row:
+            pace[:] = 1.0
         green = 0 <= row < len(gaps.some)
-        if place > 0 and green and plan[place - 1] != row:
-            opens_at(row, gaps, pace)
         for stream in range(len(veh)):
             share = rules.moves[row, stream] if row >= 0 else 0.0
             there = veh[stream] + come[stream, place]

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.scheduled.flows import Gone
 from utn_controllers.scheduled.standstill import Shown
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
@@ -43,18 +42,29 @@ class Yielding:
         """(S, L) lane sets of which a stage serves a part."""
         self._blocked = np.zeros(len(network.lane_sets), dtype=np.bool_)
         """(L,) lane sets of which who is in front had red in a stage that serves the others."""
+        self._went_s = np.zeros(len(network.lane_sets))
+        """(L,) when somebody left, or nobody was by the stop line, last."""
         self._share = np.ones(self.learnt.shape)
         """(S, L) of the discharge."""
-        self.is_needed = bool(self.learnt.any() or self._partly.any())
-        """Whether anybody gives way who has a stage of his own elsewhere, or has red beside others of his lane."""
+        self._queued = np.zeros(len(network.lane_sets), dtype=np.bool_)
+        """(L,) lane sets that had somebody by the stop line when they were last looked at."""
+        self._looked_s = np.zeros(len(network.junctions))
+        """(J,) when that was."""
+        self._left_veh = np.zeros(len(network.lane_sets))
+        """(L,) who had left by then."""
+        self._is_needed = bool(self.learnt.any() or self._partly.any())
 
-    def look(self, view: Shown, asked: Bools, present: Ints, gone: Gone) -> None:
-        """Take up who has `gone` before the junctions `asked` (J,) in their `present` stage, by its row (J,)."""
-        if self.is_needed:
+    def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats) -> None:
+        """Take up who has gone before the junctions `asked` (J,) in their `present` stage, the row (J,) that it is.
+
+        `zone` (L, zones) of View.zone_veh.
+        """
+        if self._is_needed:
             network, streams = self._network, self._streams
             _learn(
-                view.time_s, asked, present, view.begin_s, *gone,
-                network.link_junction[network.set_link], self.learnt, self._partly, self._share, self._blocked,
+                view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0],
+                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self.learnt, self._partly,
+                self._share, self._blocked, self._went_s, self._queued, self._looked_s, self._left_veh,
                 streams.lane_set, streams.first, streams.first_stage, streams.serves, self._moves,
             )  # fmt: skip
 
@@ -86,25 +96,29 @@ def _partly(streams: Streams, sets: int) -> Bools:
 
 @compiled
 def _learn(
-    time_s: float, asked: Bools, present: Ints, begin_s: Floats, gone: Floats, queued: Bools, since_s: Floats,
-    idle_s: Floats, set_junction: Ints, gives_way: Bools, partly: Bools, share: Floats, blocked: Bools,
-    stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
+    time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, flow: Floats,
+    set_junction: Ints, gives_way: Bools, partly: Bools, share: Floats, blocked: Bools, went_s: Floats, queued: Bools,
+    looked_s: Floats, before: Floats, stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
 ) -> None:  # fmt: skip
     for lane_set, junction in enumerate(set_junction):
         if not asked[junction]:
             continue
-        row, ago_s = present[junction], since_s[lane_set]
+        row, since_s = present[junction], time_s - looked_s[junction]
         for stage in range(first_stage[junction], first_stage[junction + 1]):
-            share[stage, lane_set] += min(ago_s / FORGET_S, 1.0) * (1 - share[stage, lane_set])
-        if gives_way[row, lane_set] and queued[lane_set] and time_s - ago_s >= begin_s[junction] + START_S:
-            now = share[row, lane_set] + min(ago_s / MEMORY_S, 1.0) * (gone[lane_set] - share[row, lane_set])
+            share[stage, lane_set] += min(since_s / FORGET_S, 1.0) * (1 - share[stage, lane_set])
+        if gives_way[row, lane_set] and queued[lane_set] and looked_s[junction] >= begin_s[junction] + START_S:
+            gone = (left[lane_set] - before[lane_set]) / (flow[lane_set] * since_s)
+            now = share[row, lane_set] + min(since_s / MEMORY_S, 1.0) * (gone - share[row, lane_set])
             share[row, lane_set] = min(max(now, LEAST_SHARE), 1.0)
-        if idle_s[lane_set] == 0:
-            blocked[lane_set] = False
-        elif partly[row, lane_set] and min(idle_s[lane_set], time_s - begin_s[junction]) >= BLOCKED_S:
+        if left[lane_set] > before[lane_set] or near[lane_set] < 1:
+            went_s[lane_set], blocked[lane_set] = time_s, False
+        elif partly[row, lane_set] and time_s - max(went_s[lane_set], begin_s[junction]) >= BLOCKED_S:
             blocked[lane_set] = True
+        queued[lane_set] = near[lane_set] >= 1
+        before[lane_set] = left[lane_set]
     for junction in range(len(asked)):
         if asked[junction]:
+            looked_s[junction] = time_s
             _tell(
                 first[junction], first[junction + 1], first_stage[junction], first_stage[junction + 1], stream_set,
                 serves, gives_way, partly, share, blocked, moves,
