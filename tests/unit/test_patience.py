@@ -112,9 +112,8 @@ def test_whatever_is_wished_nobody_waits_longer_than_the_longest_red(
     every_s, keenness, seed = wishes
     network = with_times(four_stages, least_s, red_s)
     longest_s = longest_red_s(teleport_s)
-    # Where one after the other, each until the next decision, takes longer it can't be kept.
-    lasts_s = np.ceil((network.least_green_s + network.clearance_s) / every_s) * every_s
-    assume(lasts_s.sum() <= longest_s - LOOK_S)
+    # Where one after the other takes longer it can't be kept.
+    assume((network.least_green_s + network.clearance_s).sum() <= longest_s - LOOK_S)
     rng = np.random.default_rng(seed)
     heads = Heads(network, lambda index, state: None, longest_red_s=longest_s)
     heads.start(0.0)
