@@ -9,11 +9,11 @@ run: .venv/.core
 	$(BIN)/utn run --controller recommended
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n logical --dist worksteal
 
 # The tests that take minutes each: 4 h runs, 2 h comparisons, the wheel.
 test-long: .venv/.dev
-	$(BIN)/python -m pytest -m long
+	$(BIN)/python -m pytest -m long -n logical --dist worksteal
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

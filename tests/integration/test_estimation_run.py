@@ -61,8 +61,8 @@ def error_of(folder: Path) -> Floats:
 
 
 def report(record_property: Callable[[str, object], None], error: Floats) -> None:
-    record_property("overall_rmse_veh", rmse(error))
-    record_property("worst_link_rmse_veh", rmse(error, 0).max())
+    record_property("overall_rmse_veh", float(rmse(error)))
+    record_property("worst_link_rmse_veh", float(rmse(error, 0).max()))
 
 
 def test_vehicles_are_estimated_within_two_over_half_an_hour(
@@ -106,7 +106,7 @@ class TestMiscountingLoops:
     ) -> None:
         error, plain = error_of(folder), error_of_plain_counting(folder)
         report(record_property, error)
-        record_property("plain_counting_rmse_veh", rmse(plain))
+        record_property("plain_counting_rmse_veh", float(rmse(plain)))
         assert rmse(plain) > 2 * OVERALL_RMSE_VEH, "the loops miscount too little: the run tests nothing"
         assert rmse(error) <= OVERALL_RMSE_VEH
         assert rmse(error) <= rmse(plain) / 4
@@ -207,8 +207,8 @@ class TestSourceQueues:
     ) -> None:
         estimated, waiting = estimate_and_truth(folder, "source_queue_veh", "waiting_veh")
         total = estimated.sum(axis=1) - waiting.sum(axis=1)
-        record_property("rmse_veh", rmse(estimated - waiting))
-        record_property("total_rmse_share", rmse(total) / waiting.sum(axis=1).max())
+        record_property("rmse_veh", float(rmse(estimated - waiting)))
+        record_property("total_rmse_share", float(rmse(total) / waiting.sum(axis=1).max()))
         assert waiting.sum(axis=1).max() > 100, "nobody had to wait: the run tests nothing"
         assert not estimated[:, ~utn17.is_source].any()
         assert rmse(estimated - waiting) <= 10
@@ -219,5 +219,5 @@ class TestSourceQueues:
     ) -> None:
         estimated, waiting = estimate_and_truth(folder, "source_queue_veh", "waiting_veh")
         unforeseen = rmse(foreseeable_queue(folder, utn17) - waiting)
-        record_property("unforeseen_rmse_veh", unforeseen)
+        record_property("unforeseen_rmse_veh", float(unforeseen))
         assert rmse(estimated - waiting) <= unforeseen + 2
