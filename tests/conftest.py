@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
+# One thread a worker: with one a processor in each, those of numpy wait for each other ten times as long as they work.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 from hypothesis import settings
 
