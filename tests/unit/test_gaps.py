@@ -79,6 +79,13 @@ def test_lanes_part_where_somebody_gives_way_and_else_not() -> None:
     assert [lanes for lanes, _ in lane_sets(alike, ["GGGg", "rrrr"])] == [(0, 1), (2,)]
 
 
+def test_lanes_part_where_one_stands_behind_who_has_red_while_another_goes() -> None:
+    ways = {0: {7: {0}, 8: {1}}, 1: {8: {2}, 9: {3}}}
+    assert [lanes for lanes, _ in lane_sets(ways, ["GGGr", "rrrG"])] == [(0,), (1,)]
+    for alike in (["GGGG", "rrrr"], ["GGGG", "Grrr"], ["GGGG", "GrrG"]):
+        assert [lanes for lanes, _ in lane_sets(ways, alike)] == [(0, 1)]
+
+
 def test_who_has_a_choice_of_lanes_takes_the_emptier_ones(street_of: StreetOf) -> None:
     network = street_of(odd_nets.plain)
     streams = Streams(network)

@@ -4,8 +4,8 @@ A left turn that waits for gaps in what comes towards it hardly moves while that
 it to itself, that one is to be shown in time.
 
 And who has green does not go at all while the first of his lane has red. Where a stage serves a part of a lane set and
-nobody of its queue has gone for a while, somebody of the other part is in front: that stage is of no use until another
-one has let somebody go.
+nobody of its queue has gone for a while, in one green or in several short ones, somebody of the other part is in front:
+that stage, and whichever serves no more of the lane set, is of no use until another one has let somebody go.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FORGET_S = 300.0
 LEAST_SHARE = 0.05
 """Of the discharge: somebody may always find a gap."""
 BLOCKED_S = 6.0
-"""After so long a green in which nobody of a queue went it is known that who is in front has red."""
+"""After so much green in which nobody of a queue went it is known that who is in front has red."""
 
 
 class Yielding:
@@ -40,10 +40,8 @@ class Yielding:
         """(S, L) lane sets that must give way in a stage, and not in another one."""
         self._partly = _partly(streams, len(network.lane_sets))
         """(S, L) lane sets of which a stage serves a part."""
-        self._blocked = np.zeros(len(network.lane_sets), dtype=np.bool_)
-        """(L,) lane sets of which who is in front had red in a stage that serves the others."""
-        self._went_s = np.zeros(len(network.lane_sets))
-        """(L,) when somebody left, or nobody was by the stop line, last."""
+        self._stood_s = np.zeros((len(network.lane_sets), int(np.diff(streams.first_stage).max())))
+        """(L, most stages of a junction) each one's green since somebody left, or nobody was by the stop line, last."""
         self._share = np.ones(self.learnt.shape)
         """(S, L) of the discharge."""
         self._queued = np.zeros(len(network.lane_sets), dtype=np.bool_)
@@ -64,7 +62,7 @@ class Yielding:
             _learn(
                 view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0],
                 network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self.learnt, self._partly,
-                self._share, self._blocked, self._went_s, self._queued, self._looked_s, self._left_veh,
+                self._share, self._stood_s, self._queued, self._looked_s, self._left_veh,
                 streams.lane_set, streams.first, streams.first_stage, streams.serves, self._moves,
             )  # fmt: skip
 
@@ -97,7 +95,7 @@ def _partly(streams: Streams, sets: int) -> Bools:
 @compiled
 def _learn(
     time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, flow: Floats,
-    set_junction: Ints, gives_way: Bools, partly: Bools, share: Floats, blocked: Bools, went_s: Floats, queued: Bools,
+    set_junction: Ints, gives_way: Bools, partly: Bools, share: Floats, stood_s: Floats, queued: Bools,
     looked_s: Floats, before: Floats, stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
 ) -> None:  # fmt: skip
     for lane_set, junction in enumerate(set_junction):
@@ -111,9 +109,9 @@ def _learn(
             now = share[row, lane_set] + min(since_s / MEMORY_S, 1.0) * (gone - share[row, lane_set])
             share[row, lane_set] = min(max(now, LEAST_SHARE), 1.0)
         if left[lane_set] > before[lane_set] or near[lane_set] < 1:
-            went_s[lane_set], blocked[lane_set] = time_s, False
-        elif partly[row, lane_set] and time_s - max(went_s[lane_set], begin_s[junction]) >= BLOCKED_S:
-            blocked[lane_set] = True
+            stood_s[lane_set] = 0.0
+        elif partly[row, lane_set]:
+            stood_s[lane_set, row - first_stage[junction]] += min(since_s, time_s - begin_s[junction])
         queued[lane_set] = near[lane_set] >= 1
         before[lane_set] = left[lane_set]
     for junction in range(len(asked)):
@@ -121,19 +119,40 @@ def _learn(
             looked_s[junction] = time_s
             _tell(
                 first[junction], first[junction + 1], first_stage[junction], first_stage[junction + 1], stream_set,
-                serves, gives_way, partly, share, blocked, moves,
+                serves, gives_way, partly, share, stood_s, moves,
             )  # fmt: skip
 
 
 @inlined
 def _tell(
     first: int, last: int, first_stage: int, last_stage: int, stream_set: Ints, serves: Bools, gives_way: Bools,
-    partly: Bools, share: Floats, blocked: Bools, moves: Floats,
+    partly: Bools, share: Floats, stood_s: Floats, moves: Floats,
 ) -> None:  # fmt: skip
     """Puts what is known of one junction's lane sets into its `moves`."""
     for stage in range(first_stage, last_stage):
         for stream in range(first, last):
             lane_set = stream_set[stream]
             if serves[stage, stream] and (gives_way[stage, lane_set] or partly[stage, lane_set]):
-                is_blocked = partly[stage, lane_set] and blocked[lane_set]
+                is_blocked = (
+                    partly[stage, lane_set]
+                    and _known_s(first, last, first_stage, last_stage, stage, lane_set, stream_set, serves, stood_s)
+                    >= BLOCKED_S
+                )
                 moves[stage, stream - first] = LEAST_SHARE if is_blocked else share[stage, lane_set]
+
+
+@inlined
+def _known_s(
+    first: int, last: int, first_stage: int, last_stage: int, stage: int, lane_set: int, stream_set: Ints,
+    serves: Bools, stood_s: Floats,
+) -> float:  # fmt: skip
+    """For how long nobody of a lane set has gone in this stage or in one that serves as much of it and more [s]."""
+    known_s = 0.0
+    for tried in range(first_stage, last_stage):
+        stood = stood_s[lane_set, tried - first_stage]
+        if stood > 0:
+            for stream in range(first, last):
+                if stream_set[stream] == lane_set and serves[stage, stream] and not serves[tried, stream]:
+                    stood = 0.0
+            known_s += stood
+    return known_s

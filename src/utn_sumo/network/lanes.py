@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from utn_sumo.clearances import GIVES_WAY
+from utn_sumo.clearances import GIVES_WAY, GREEN
 
 Ways = Mapping[int, set[int]]
 """The turns that go from some lanes, and the letters of the signals by which they do."""
@@ -29,13 +29,15 @@ def lane_groups(turns: Iterable[tuple[str, Iterable[int]]]) -> list[tuple[tuple[
 def lane_sets(ways: Mapping[int, Ways], states: Iterable[str]) -> list[tuple[tuple[int, ...], Ways]]:
     """The sets into which the lanes of one group part, with their ways, from the ways of each lane.
 
-    Where nobody of it gives way in any of the junction's `states`, all lanes move alike and are one set. Else a lane
-    from which somebody waits for gaps is slower than one without, and lanes are a set if they have the same turns by
-    signals that always show the same.
+    All lanes move alike and are one set where in none of the junction's `states` somebody of the group gives way, nor
+    one lane goes while who is first in another one may have red. Else a lane from which somebody waits for gaps is
+    slower than one without, one behind a red arrow stands, and lanes are a set if they have the same turns by signals
+    that always show the same.
     """
     shown = list(states)
     letters = {letter for own in ways.values() for each in own.values() for letter in each}
-    together = not any(state[letter] == GIVES_WAY for state in shown for letter in letters)
+    gives_way = any(state[letter] == GIVES_WAY for state in shown for letter in letters)
+    together = not gives_way and not any(_some_stand(ways.values(), state) for state in shown)
     found: dict[str, list[int]] = {}
     for lane, own in ways.items():
         moves = [(turn, sorted({"".join(state[each] for state in shown) for each in own[turn]})) for turn in own]
@@ -48,3 +50,9 @@ def lane_sets(ways: Mapping[int, Ways], states: Iterable[str]) -> list[tuple[tup
                 whole.setdefault(turn, set()).update(own_letters)
         sets.append((tuple(lanes), dict(sorted(whole.items()))))
     return sets
+
+
+def _some_stand(lanes: Iterable[Ways], state: str) -> bool:
+    """Whether who is first in a lane may have red while all of another lane have green."""
+    greens = [{state[letter] in GREEN for letters in own.values() for letter in letters} for own in lanes]
+    return {True} in greens and {True, False} in greens

@@ -276,7 +276,7 @@ class _Reader:
         turn_index: Mapping[tuple[int, str], int],
         stages: Sequence[Stage],
     ) -> list[LaneSet]:
-        """The lanes of each group, parted where somebody of it gives way."""
+        """The lanes of each group, parted where they do not move alike."""
         letters: dict[tuple[int, int], set[int]] = {}
         for signal in self.signals:
             for connection, letter in signal.connections:
