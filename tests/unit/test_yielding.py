@@ -40,16 +40,26 @@ def turns_of(network: Network, group: int) -> set[int]:
     return set(np.flatnonzero(network.turn_group == group).tolist())
 
 
-def an_arrow_for_a_shared_lane(folder: Path) -> Path:
-    """All turns of a road have one lane, and left turns from north and south an arrow: others may stand before it."""
+def single_lanes(folder: Path, *greens: str) -> Path:
+    """All turns of a road have one lane; north and south have these stages, east and west one."""
     shown = (
-        *((20, odd_nets.NORTH_SOUTH), (3, "yyyrrryyyrrr"), (2, odd_nets.DARK)),
-        *((10, "rrGrrrrrGrrr"), (3, "rryrrrrryrrr"), (2, odd_nets.DARK)),
-        *odd_nets.TWO_STAGES[3:],
+        phase
+        for green in greens
+        for phase in ((20, green), (3, green.replace("G", "y").replace("g", "y")), (2, odd_nets.DARK))
     )
     net = odd_nets.row("C").net(folder, odd_nets.NO_TURNAROUNDS)
-    odd_nets.retime(net, odd_nets.tl_logic("C", shown))
+    odd_nets.retime(net, odd_nets.tl_logic("C", (*shown, *odd_nets.TWO_STAGES[3:])))
     return odd_nets.case(folder, odd_nets.traffic("C"))
+
+
+def an_arrow_for_a_shared_lane(folder: Path) -> Path:
+    """Left turns have an arrow: others may stand before it."""
+    return single_lanes(folder, odd_nets.NORTH_SOUTH, "rrGrrrrrGrrr")
+
+
+def parts_of_a_lane(folder: Path) -> Path:
+    """A stage for all but left turns, one for right turns alone and one for left turns alone."""
+    return single_lanes(folder, "GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrGrrr")
 
 
 @pytest.fixture
@@ -157,40 +167,23 @@ def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_
     assert (moves[arrow, own] == 1).all()
 
 
-def parts_of_a_lane(folder: Path) -> Path:
-    """All turns of a road have one lane: north and south have a stage for all but left turns, for right turns alone
-    and for left turns alone."""
-    shown = (
-        *((20, "GGrrrrGGrrrr"), (3, "yyrrrryyrrrr"), (2, odd_nets.DARK)),
-        *((10, "GrrrrrGrrrrr"), (3, "yrrrrryrrrrr"), (2, odd_nets.DARK)),
-        *((10, "rrGrrrrrGrrr"), (3, "rryrrrrryrrr"), (2, odd_nets.DARK)),
-        *odd_nets.TWO_STAGES[3:],
-    )
-    net = odd_nets.row("C").net(folder, odd_nets.NO_TURNAROUNDS)
-    odd_nets.retime(net, odd_nets.tl_logic("C", shown))
-    return odd_nets.case(folder, odd_nets.traffic("C"))
-
-
 def test_short_greens_in_which_nobody_goes_add_up_for_all_stages_that_serve_no_more(street_of: StreetOf) -> None:
     network = street_of(parts_of_a_lane)
     streams = Streams(network)
     moves = Moves(network, streams, 2).share
     learning = Yielding(network, streams, moves)
     shown = [network.stages[stage].state for stage in streams.stage]
-    most, right, left, across = (
-        shown.index(each) for each in ("GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrGrrr", shown[3])
-    )
+    most, right, left = (shown.index(each) for each in ("GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrGrrr"))
+    across = shown.index(odd_nets.EAST_WEST)
     queue = by_the_line(np.full(len(network.groups), QUEUE_VEH))
     left_veh = np.zeros(len(network.lane_sets))
     green_s = 0.8 * BLOCKED_S
 
     def look(row: int, begin_s: float) -> list[bool]:
+        """Of which of the three stages it is thought, after this green, that all go who have green in it."""
         view = replace(scene(network, begin_s + green_s), begin_s=np.array([begin_s]), left_veh=left_veh.copy())
         learning.look(view, np.array([True]), np.array([row]), queue)
-        before_it = np.flatnonzero(streams.serves[most])
-        return [
-            bool((moves[each, before_it][streams.serves[each, before_it]] == 1).all()) for each in (most, right)
-        ] + [bool((moves[left, streams.serves[left]] == 1).all())]
+        return [bool((moves[each, streams.serves[each]] == 1).all()) for each in (most, right, left)]
 
     assert look(most, 0.0) == [True, True, True]
     assert look(across, 10.0) == [True, True, True]
