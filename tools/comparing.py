@@ -14,7 +14,7 @@ from scipy import stats
 
 from utn_sumo import bridge, campaign, controllers, native, streets
 from utn_sumo.case import SUFFIX
-from utn_sumo.errors import ResultError
+from utn_sumo.errors import NetworkError, ResultError
 from utn_sumo.scenario import EXACT, flat, scenario
 
 SPENT = "total_time_spent_veh_h"
@@ -51,7 +51,10 @@ def jobs(
     chosen = {name: _controller(name) for name in names}
     found = []
     for net in nets:
-        streets.named(net)
+        try:
+            streets.named(net)
+        except NetworkError as error:  # which of several it is
+            raise NetworkError(f"net {net!r}: {error}") from error
         own = net.endswith(SUFFIX)
         lasting = {"hours": 2.0 if hours is None else hours} if not own or hours is not None else {}
         for demand in demands or ["1.0" if own else "1.3"]:

@@ -5,8 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 import comparing
 from utn_sumo import campaign
+from utn_sumo.errors import NetworkError
+
+from . import odd_nets
 
 BROKEN = """
 import os
@@ -39,3 +44,10 @@ def test_a_controller_that_breaks_leaves_the_others_alone_and_is_tried_again(tmp
     lines = [json.loads(line)["job"]["controller"] for line in record.read_text(encoding="utf-8").splitlines()]
     assert len(lines) == 5
     assert lines.count("fixed") == 1
+
+
+def test_of_several_nets_the_one_is_named_that_can_not_be_read(tmp_path: Path) -> None:
+    refused = str(odd_nets.no_internal_links(tmp_path))
+    with pytest.raises(NetworkError, match="internal links") as raised:
+        comparing.jobs(["utn17", refused], ["1.0"], ["fixed"], [1], 0.1)
+    assert refused in str(raised.value)
