@@ -141,6 +141,8 @@ class Junction:
     """conflicts[a][b]: the streams of letters a and b cross, or come from two roads into one lane."""
     without_yellow: tuple[int, ...] = ()
     """Letters that need none: pedestrian crossings', and those of no stream."""
+    made_to_yield: tuple[int, ...] = ()
+    """Letters that give way (g) in stages in which the net itself protects them (G) beside others that they meet."""
 
     @property
     def is_walked(self) -> bool:

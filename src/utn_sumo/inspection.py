@@ -38,6 +38,7 @@ def _junction(network: Network, index: int, refused: Mapping[str, str]) -> dict[
         "green_budget_s": float(part.green_budget_s[0]),
         "links": [link.id for link in part.links],
         "refused": refused.get(junction.id, ""),
+        "made_to_yield": list(junction.made_to_yield),
     }
 
 

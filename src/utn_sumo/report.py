@@ -195,6 +195,13 @@ def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
     console.print(f"plots and mismatch.json: {folder}", markup=False)
 
 
+def _controlled(junction: dict[str, Any]) -> str:
+    if junction["refused"]:
+        return f"no: {junction['refused']}"
+    late = ", ".join(map(str, junction["made_to_yield"]))
+    return f"yes, signal {late} gives way to who has green with it" if late else "yes"
+
+
 def inspection_table(found: dict[str, Any], folder: Path) -> None:
     """Junctions, links, and what is left alone."""
     console = Console(width=None if sys.stdout.isatty() else 140)
@@ -204,9 +211,7 @@ def inspection_table(found: dict[str, Any], folder: Path) -> None:
     for each in found["junctions"]:
         numbers = [f"{each[key]:g}" for key in ("cycle_s", "offset_s")]
         numbers += [str(len(each["stages"])), f"{each['green_budget_s']:g}"]
-        view.add_row(
-            each["id"], *numbers, ", ".join(each["links"]), f"no: {each['refused']}" if each["refused"] else "yes"
-        )
+        view.add_row(each["id"], *numbers, ", ".join(each["links"]), _controlled(each))
     for signal, reason in found["left_alone"].items():
         view.add_row(signal, "", "", "", "", "", f"no: {reason}")
     console.print(view)

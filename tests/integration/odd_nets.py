@@ -191,6 +191,18 @@ def _through_pockets() -> str:
     return "".join(flow(f"{a}_{b}", f"{a}-p{a}", f"C-{b}", period=10) for a, b in ways)
 
 
+def lefts_that_meet(folder: Path) -> Path:
+    """A stage with protected greens for two left turns whose ways cross, as netconvert has it: not one of `CASES`.
+
+    From the south they have a lane of their own, from the north none.
+    """
+    streets = row("C").without("sC-C")
+    streets.one_way("sC", "C", lanes=2)
+    streets.net(folder, NO_TURNAROUNDS)
+    lefts = flow("north", "nC-C", "C-E", period=8) + flow("south", "sC-C", "C-W", period=8)
+    return case(folder, traffic("C") + lefts)
+
+
 def plain(folder: Path) -> Path:
     """Nothing odd: what the others differ from."""
     row("C").net(folder, NO_TURNAROUNDS)

@@ -10,6 +10,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from click.testing import CliRunner
+from tests.integration import odd_nets
 
 from utn_sumo import bridge, case, forecast_report, replay, streets, traffic
 from utn_sumo.cli import cli
@@ -193,6 +194,21 @@ def test_a_junction_whose_own_stages_conflict_is_left_alone_and_named(town: Path
     assert set(result["left_alone"]) == {"J2"}
     assert "conflict" in result["left_alone"]["J2"]
     assert (result["unsafe_signal_s"], result["fallbacks"]) == (0, 0)
+
+
+@pytest.mark.parametrize("controller", ["recommended", "dmpc", "actuated", "native"])
+def test_left_turns_that_meet_are_controlled_and_one_of_them_gives_way(tmp_path: Path, controller: str) -> None:
+    folder = tmp_path / "case"
+    folder.mkdir()
+    file = odd_nets.lefts_that_meet(folder)
+    result = bridge.run(scenario(net=str(file), controller=controller), tmp_path / "run")
+    assert result["left_alone"] == {}
+    if controller == "native":
+        # Its own programme protects both.
+        assert result["unsafe_signal_s"] > 0
+        assert "signals 2 and 8 conflict and are open together" in result["unsafe_reasons"][0]
+    else:
+        assert (result["unsafe_signal_s"], result["fallbacks"], result["teleports"]) == (0, 0, 0)
 
 
 CLASH = [(60, "GGGGGG"), (3, "yyyyyy"), (50, "rrrGGG"), (7, "rrryyy")]

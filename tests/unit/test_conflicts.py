@@ -65,6 +65,36 @@ def test_oncoming_streams_and_those_of_one_road_are_at_peace(street_of: StreetOf
     assert frozenset((NORTH + RIGHT, SOUTH + RIGHT)) not in found
 
 
+def test_of_left_turns_that_meet_in_a_stage_of_theirs_the_second_by_the_right_of_way_gives_way(
+    street_of: StreetOf,
+) -> None:
+    net = street_of(odd_nets.lefts_that_meet)
+    north, south = NORTH + LEFT, SOUTH + LEFT
+    assert frozenset((north, south)) in conflicting(net)
+    assert net.junctions[0].made_to_yield == (north,)
+    (stage,) = (stage for stage in net.stages if stage.state[NORTH + AHEAD] == "r" and stage.state[north] in "Gg")
+    assert (stage.state[north], stage.state[south]) == ("g", "G")
+    assert not signals.refused(net)
+
+
+def test_left_turns_that_pass_each_other_keep_their_protected_greens(street_of: StreetOf) -> None:
+    net = street_of(odd_nets.turning_pockets)
+    assert net.junctions[0].made_to_yield == ()
+    assert any(stage.state.count("G") == 2 for stage in net.stages)
+
+
+def both_roads_at_once(folder: Path) -> Path:
+    clears = [(3, "yyyyyyyyyyyy"), (30, "rrrGGgrrrGGg"), (3, "rrryyyrrryyy"), (2, DARK)]
+    return retime(plain(folder), tl_logic("C", [(30, "GGgGGgGGgGGg"), *clears]))
+
+
+def test_who_drives_straight_across_another_road_is_not_made_to_give_way(street_of: StreetOf) -> None:
+    net = street_of(both_roads_at_once)
+    ahead = [arm + AHEAD for arm in (NORTH, EAST, SOUTH, WEST)]
+    assert [net.stages[0].state[letter] for letter in ahead] == ["G"] * 4
+    assert "are both green" in signals.refused(net)["C"]
+
+
 def narrowing(folder: Path) -> Path:
     """Two lanes from the west lead ahead into one, each with a letter of its own."""
     drawn = row("C").without("W-C")

@@ -9,8 +9,8 @@ seconds is never a stage: nobody could use it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
@@ -79,6 +79,15 @@ class Programme:
             grouped[0] = [*last, *grouped[0]]
             offset_s -= sum(phase.duration_s for phase in last)
         return cls(tuple(_merged(group) for group in grouped), offset_s)
+
+    def yielding(self, second: Collection[tuple[int, int]]) -> Programme:
+        """With g in place of G for the first of these pairs of letters, in phases in which both have G."""
+        phases = []
+        for phase in self.phases:
+            late = {a for a, b in second if phase.state[a] == phase.state[b] == "G"}
+            state = "".join("g" if letter in late else shown for letter, shown in enumerate(phase.state))
+            phases.append(replace(phase, state=state))
+        return replace(self, phases=tuple(phases))
 
     @property
     def cycle_s(self) -> float:

@@ -184,8 +184,9 @@ class _Reader:
         stages: list[Stage] = []
         junctions: list[Junction] = []
         for position, signal in enumerate(self.signals):
-            programme = signal.programme
-            assert programme is not None
+            assert signal.programme is not None
+            second = signal.second()
+            programme = signal.programme.yielding(second)
             signal_turns = self._signal_turns(signal, turn_index)
             first = len(stages)
             walked = set(range(signal.letters)) - signal.of_vehicles
@@ -197,8 +198,9 @@ class _Reader:
                     cycle_s=programme.cycle_s,
                     offset_s=programme.offset_s + programme.begin_s,
                     signal_turns=signal_turns,
-                    conflicts=signal.conflicts(),
+                    conflicts=signal.conflicts,
                     without_yellow=tuple(sorted(walked)),
+                    made_to_yield=tuple(sorted({letter for letter, _ in second})),
                 )
             )
         edges = sorted({edge for link in links for edge in link.edges} | {turn.to_edge for turn in turns})

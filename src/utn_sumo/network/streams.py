@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ class Signal:
         """Edges with motor traffic that it stops."""
         return sorted({each.getFrom().getID() for each in for_motors(connection for connection, _ in self.connections)})
 
+    @cached_property
     def conflicts(self) -> tuple[tuple[bool, ...], ...]:
         """Which letters' streams conflict, by the net's right-of-way matrix.
 
@@ -63,6 +65,35 @@ class Signal:
                 if a != b and not at_peace:
                     matrix[a][b] = matrix[b][a] = True
         return tuple(tuple(row) for row in matrix)
+
+    def second(self) -> set[tuple[int, int]]:
+        """Pairs of letters that conflict and have protected greens together, of which the first turns and gives way.
+
+        By the net's right-of-way matrix. netconvert gives opposite left turns such a stage even where they meet, amid a
+        skew or wide junction.
+        """
+        if self.programme is None:
+            return set()
+        return {
+            (a, b)
+            for a, b in permutations(range(self.letters), 2)
+            if self.conflicts[a][b]
+            and any(phase.state[a] == phase.state[b] == "G" for phase in self.programme.phases)
+            and self._gives_way(a, b)
+            and not self._gives_way(b, a)
+        }
+
+    def _gives_way(self, a: int, b: int) -> bool:
+        """Whether all of letter `a` whom anybody of letter `b` comes in the way of turn, and must give way to him."""
+        before = [
+            connection.getDirection() != STRAIGHT and node.forbids(other, connection)
+            for connection, letter in self.connections
+            for other, other_letter in self.connections
+            if (letter, other_letter) == (a, b)
+            and (node := connection.getFrom().getToNode()) is other.getFrom().getToNode()
+            and node.areFoes(node.getLinkIndex(connection), node.getLinkIndex(other))
+        ]
+        return bool(before) and all(before)
 
 
 @dataclass(frozen=True)
