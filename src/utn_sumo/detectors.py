@@ -31,6 +31,8 @@ STOP_LINE_M = -1.0
 """Stop-line loops stand this far before the end of the last edge."""
 TURN_M = 1.0
 """Turn loops stand this far behind the stop line."""
+CREEPING_M_S = 4.0
+"""Who is slower amid a junction has not got away from it: with whom he stood behind gone, he may stop for others."""
 CAR_M = 5.0
 """The detector of a zone ends so much before the zone: it sees a car until its back has gone by."""
 LEAST_M = 0.1
@@ -137,11 +139,11 @@ def _amid(network: Network) -> list[tuple[str, ...]]:
     }
     shared = {(network.turns[turn].link, lane) for turn in waiting for lane in network.turns[turn].from_lanes}
 
-    def lanes(index: int, turn: Turn) -> tuple[str, ...]:
-        ways = zip(turn.via_lanes, turn.from_lanes, strict=True)
-        return tuple(via for via, lane in ways if index in waiting or (turn.link, lane) in shared)
+    def is_seen(index: int, turn: Turn) -> bool:
+        # All of its lanes: amid the junction too, who is behind somebody moves over to the next one.
+        return index in waiting or any((turn.link, lane) in shared for lane in turn.from_lanes)
 
-    return [lanes(index, turn) for index, turn in enumerate(network.turns)]
+    return [turn.via_lanes if is_seen(index, turn) else () for index, turn in enumerate(network.turns)]
 
 
 def _named(kind: str, lane: str) -> str:
@@ -206,7 +208,8 @@ def write(network: Network, path: Path, period_s: float, *, within_step: bool = 
         ET.SubElement(root, "inductionLoop", {"id": _named(kind, lane), **place, **report})
     for kind, lane, from_m, to_m in _areas(network, within_step=within_step):
         place = {"lane": lane, "pos": _metres(from_m), "endPos": _metres(to_m)}
-        ET.SubElement(root, "laneAreaDetector", {"id": _named(kind, lane), **place, **report})
+        halting = {"speedThreshold": f"{CREEPING_M_S:g}", "timeThreshold": "0"} if kind == "amid" else {}
+        ET.SubElement(root, "laneAreaDetector", {"id": _named(kind, lane), **place, **halting, **report})
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
 

@@ -16,7 +16,7 @@ from tests.integration import odd_nets
 from utn_sumo import bridge, monitor, streets
 from utn_sumo.contract import EXIT, Network
 from utn_sumo.controllers import EXECUTION, registered
-from utn_sumo.detectors import CAR_M, ids, write
+from utn_sumo.detectors import CAR_M, CREEPING_M_S, ids, write
 from utn_sumo.errors import ControllerError, SettingError, UtnError
 from utn_sumo.plant.eyes import Eyes, Sight
 from utn_sumo.plant.heads import Heads
@@ -224,6 +224,33 @@ def test_who_stands_amid_a_junction_is_stuck_unless_the_road_ahead_is_what_stops
     assert eyes.stuck_veh(other) == 0
     sumo.full = True
     assert eyes.stuck_veh(turn) == 0
+
+
+def test_who_creeps_amid_a_junction_is_stuck_on_whichever_of_its_lanes(tmp_path: Path) -> None:
+    import libsumo
+
+    odd_nets.row("C", lanes=2).net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    case_file = odd_nets.case(
+        tmp_path, odd_nets.traffic("C", period=4) + odd_nets.flow("left", "E-C", "C-sC", period=4)
+    )
+    net = streets.named(str(case_file))
+    write(net, tmp_path / "detectors.add.xml", 90, within_step=True)
+    eyes = Eyes(net, ids(net), libsumo)
+    ahead = [turn for turn, each in enumerate(net.turns) if len(each.via_lanes) > 1]
+    assert ahead
+    creeping, off = 0, 0
+    libsumo.start(["sumo", "-c", str(case_file), "-a", str(tmp_path / "detectors.add.xml"), "--no-step-log"])
+    try:
+        for _ in range(240):
+            libsumo.simulationStep()
+            for turn in ahead:
+                inside = [veh for lane in net.turns[turn].via_lanes for veh in libsumo.lane.getLastStepVehicleIDs(lane)]
+                slow = sum(libsumo.vehicle.getSpeed(vehicle) < CREEPING_M_S for vehicle in inside)
+                creeping, off = creeping + slow, off + abs(eyes.stuck_veh(turn) - slow)
+    finally:
+        libsumo.close()
+    assert creeping > 20
+    assert off == 0
 
 
 SEES = """

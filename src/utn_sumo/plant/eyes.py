@@ -125,7 +125,7 @@ class Eyes:
         return float(sum(map(self._present, self._amid[turn])))
 
     def stuck_veh(self, turn: int) -> float:
-        """Of a turn, standing on its lanes amid the junction; none where it may be the road ahead that stops them."""
+        """Of a turn, standing or creeping on its lanes amid the junction; none where the road ahead may be why."""
         # Somebody is on its entry loops: it is full, or has just let one more in.
         if any(since_s <= 0 for since_s in map(self._since_s, self._ahead[turn])):
             return 0.0
