@@ -43,10 +43,17 @@ def write(name: str, folder: Path, rng: np.random.Generator) -> Path:
         seed = int(rng.integers(1, 1_000_000))
         tuning_nets.run("netgenerate", *words, "-o", str(net), seed=seed)
         found = network.load(str(net))
-        if _ends(net) >= LEAST_ENDS and found.junctions:
-            break
+        if ends(net) >= LEAST_ENDS and found.junctions:
+            return fill(net, found, seed, people=people)
+
+
+def fill(net: Path, found: Network, seed: int, *, people: bool) -> Path:
+    """Write traffic for NAME.net.xml beside it, as much at demand 1.0 as its busiest junction can serve; its .sumocfg.
+
+    Raises UtnError.
+    """
     tuning_nets.drive(net, TRIAL_VEH_H, 0.0, seed)
-    veh_h = TRIAL_VEH_H / busy(found, net.with_name(f"{name}.rou.xml"))
+    veh_h = TRIAL_VEH_H / busy(found, net.with_name(net.name.replace("net.xml", "rou.xml")))
     return tuning_nets.drive(net, veh_h, WALKERS * veh_h * people, seed)
 
 
@@ -81,7 +88,7 @@ def _words(rng: np.random.Generator) -> tuple[list[str], bool]:
     return [*words, "--no-turnarounds.fringe"], people
 
 
-def _ends(net: Path) -> int:
+def ends(net: Path) -> int:
     """Edges of the rim: that lead in or that lead out, whichever are fewer."""
     import sumolib  # noqa: PLC0415 - slow
 

@@ -90,8 +90,9 @@ def drive(net: Path, veh_h: float, walkers_h: float, seed: int) -> Path:
         net.with_name(net.name.replace("net.xml", kind)) for kind in ("trips.xml", "rou.xml", "sumocfg")
     )
     ET.ElementTree(_traffic(net, veh_h, walkers_h, seed)).write(trips)
-    # Of ways that are much alike each vehicle takes its own.
-    run("duarouter", "-n", str(net), "-r", str(trips), "-o", str(routes), "--weights.random-factor", "1.5")
+    # Of ways that are much alike each vehicle takes its own. Where streets are one-way, some trips have none.
+    words = ["-n", str(net), "-r", str(trips), "-o", str(routes), "--weights.random-factor", "1.5", "--ignore-errors"]
+    run("duarouter", *words)
     root = ET.Element("configuration")
     for key, value in {"net-file": net.name, "route-files": routes.name, "begin": "0", "end": f"{WINDOW_S:g}"}.items():
         ET.SubElement(root, key, value=value)

@@ -26,11 +26,24 @@ def sumo_binary(name: str) -> Path:
 
 def run_tool(name: str, arguments: Sequence[str]) -> None:
     """Run one of SUMO's Python tools, as `tlsCoordinator.py`. Raises PlantError if it isn't there or breaks off."""
-    homes = [*_homes(), *(Path(home) for home in [os.environ.get("SUMO_HOME")] if home)]
-    home = next((each for each in homes if (each / "tools" / name).is_file()), None)
-    if home is None:
-        raise PlantError(f"{name!r} isn't installed: run pip install 'utn-sumo[sumo]', which brings SUMO's tools")
+    home = _home_with(f"tools/{name}")
     run_program(name, [sys.executable, str(home / "tools" / name), *arguments], home)
+
+
+def data_file(name: str) -> Path:
+    """A file of SUMO's data, as `typemap/osmNetconvert.typ.xml`. Raises PlantError if it isn't there."""
+    return _home_with(f"data/{name}") / "data" / name
+
+
+def _home_with(name: str) -> Path:
+    """A folder of SUMO in which there is this file."""
+    homes = [*_homes(), *(Path(home) for home in [os.environ.get("SUMO_HOME")] if home)]
+    home = next((each for each in homes if (each / name).is_file()), None)
+    if home is None:
+        raise PlantError(
+            f"{Path(name).name!r} isn't installed: run pip install 'utn-sumo[sumo]', which brings SUMO's tools"
+        )
+    return home
 
 
 def run_program(name: str, words: Sequence[str], home: Path | None = None) -> None:
