@@ -31,7 +31,7 @@ STOP_LINE_M = -1.0
 """Stop-line loops stand this far before the end of the last edge."""
 TURN_M = 1.0
 """Turn loops stand this far behind the stop line."""
-CREEPING_M_S = 4.0
+CREEPING_M_S = 3.0
 """Who is slower amid a junction has not got away from it: with whom he stood behind gone, he may stop for others."""
 CAR_M = 5.0
 """The detector of a zone ends so much before the zone: it sees a car until its back has gone by."""
