@@ -1,14 +1,16 @@
-"""Nets drawn by chance: another seed, another net; the same one the same, at capacity at demand 1.0."""
+"""Nets and towns drawn by chance: another seed, another one; the same one the same, at capacity at demand 1.0."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import drawn_nets
+import drawn_towns
 from utn_sumo import network
 
 
@@ -17,10 +19,11 @@ def routes(config: str) -> bytes:
     return text[text.index(b"<vehicle") :]
 
 
-def test_a_seed_draws_the_same_nets_and_another_one_others(tmp_path: Path) -> None:
+@pytest.mark.parametrize("tool", [drawn_nets, drawn_towns], ids=["nets", "towns"])
+def test_a_seed_draws_the_same_and_another_one_others(tool: ModuleType, tmp_path: Path) -> None:
     def drawn(seed: int, name: str) -> list[bytes]:
         words = [str(tmp_path / name), "--seed", str(seed), "--count", "2"]
-        said = CliRunner().invoke(drawn_nets.main, words, catch_exceptions=False)
+        said = CliRunner().invoke(tool.main, words, catch_exceptions=False)
         return [routes(line) for line in said.output.split()]
 
     first, again, other = drawn(3, "a"), drawn(3, "b"), drawn(4, "c")

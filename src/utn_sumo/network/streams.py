@@ -72,13 +72,12 @@ class Signal:
         By the net's right-of-way matrix. netconvert gives opposite left turns such a stage even where they meet, amid a
         skew or wide junction.
         """
-        if self.programme is None:
-            return set()
+        phases = self.programme.phases if self.programme else ()
         return {
             (a, b)
             for a, b in permutations(range(self.letters), 2)
             if self.conflicts[a][b]
-            and any(phase.state[a] == phase.state[b] == "G" for phase in self.programme.phases)
+            and any(phase.state[a] == phase.state[b] == "G" for phase in phases)
             and self._gives_way(a, b)
             and not self._gives_way(b, a)
         }
