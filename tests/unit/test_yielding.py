@@ -53,13 +53,13 @@ def single_lanes(folder: Path, *greens: str) -> Path:
 
 
 def an_arrow_for_a_shared_lane(folder: Path) -> Path:
-    """Left turns have an arrow: others may stand before it."""
-    return single_lanes(folder, odd_nets.NORTH_SOUTH, "rrGrrrrrGrrr")
+    """Left turns from the north have an arrow: others may stand before it."""
+    return single_lanes(folder, odd_nets.NORTH_SOUTH, "rrGrrrrrrrrr")
 
 
 def parts_of_a_lane(folder: Path) -> Path:
-    """A stage for all but left turns, one for right turns alone and one for left turns alone."""
-    return single_lanes(folder, "GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrGrrr")
+    """A stage for all but left turns, one for right turns alone and one for left turns from the north alone."""
+    return single_lanes(folder, "GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrrrrr")
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_short_greens_in_which_nobody_goes_add_up_for_all_stages_that_serve_no_m
     moves = Moves(network, streams, 2).share
     learning = Yielding(network, streams, moves)
     shown = [network.stages[stage].state for stage in streams.stage]
-    most, right, left = (shown.index(each) for each in ("GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrGrrr"))
+    most, right, left = (shown.index(each) for each in ("GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrrrrr"))
     across = shown.index(odd_nets.EAST_WEST)
     queue = by_the_line(np.full(len(network.groups), QUEUE_VEH))
     left_veh = np.zeros(len(network.lane_sets))
