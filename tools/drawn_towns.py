@@ -204,16 +204,14 @@ def write(name: str, folder: Path, rng: np.random.Generator) -> Path:
     folder = recording.new_folder(folder, "")
     osm, net = folder / f"{name}.osm.xml", folder / f"{name}.net.xml"
     while True:
-        drawn(rng).write(osm)
+        town = drawn(rng)
         seed, people = int(rng.integers(1, 1_000_000)), bool(rng.uniform() < drawn_nets.WALKED)
-        imported(osm, net, seed, people=people)
-        try:
-            found = network.load(str(net))
-        except UtnError:
-            # No signals in it.
+        if not any(map(town.is_signal, range(len(town.nodes)))):
             continue
+        town.write(osm)
+        imported(osm, net, seed, people=people)
         if drawn_nets.ends(net) >= drawn_nets.LEAST_ENDS:
-            return drawn_nets.fill(net, found, seed, people=people)
+            return drawn_nets.fill(net, network.load(str(net)), seed, people=people)
 
 
 @click.command()
