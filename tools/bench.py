@@ -17,13 +17,11 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +42,7 @@ from utn_sumo import (
     campaign,
     mismatch,
     network,
+    processes,
     recording,
     replay,
     report,
@@ -321,7 +320,7 @@ def foresight(forecasts: str, demands: str, noises: str, seeds: str, *, as_json:
         for method in methods
         for seed in seeds.split(",")
     ]
-    with ProcessPoolExecutor(os.cpu_count(), max_tasks_per_child=1) as pool:
+    with processes.pool(afresh=True) as pool:
         results = list(pool.map(campaign.measures, jobs))
     delays: dict[tuple[float, float, str], list[float]] = {}
     for job, result in zip(jobs, results, strict=True):

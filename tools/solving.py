@@ -13,10 +13,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ from utn_controllers.mpc.distributed import DistributedMPC
 from utn_controllers.mpc.exact import ExactProblem, rolled_out_cost
 from utn_controllers.mpc.settings import ProblemSettings
 from utn_controllers.mpc.whole import programs
-from utn_sumo import bridge, calibration, network, recording
+from utn_sumo import bridge, calibration, network, processes, recording
 from utn_sumo.contract import Forecast, Network, State
 from utn_sumo.errors import ControllerError
 from utn_sumo.scenario import scenario
@@ -214,7 +212,7 @@ def closed_loop(
 ) -> list[dict[str, Any]]:
     """Time spent in SUMO on `utn17` under the default controller with each of these settings; two runs at a time."""
     jobs = [{"hours": hours, "demand": demand, "seed": seed, "settings": way} for way in ways for seed in seeds]
-    with ProcessPoolExecutor(2, max_tasks_per_child=1) as workers:
+    with processes.pool(2, afresh=True) as workers:
         spent = [result["total_time_spent_veh_h"] for result in workers.map(_run, jobs)]
     by_way = np.array(spent).reshape(len(ways), len(seeds))
     return [
@@ -329,7 +327,7 @@ def scale_part(wanted: Wanted) -> dict[str, Any]:
     rows = []
     for kind in wanted.grids:
         for junctions in sorted(wanted.sizes):
-            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            with processes.pool(1) as pool:
                 rows.append(pool.submit(scaling.scale, kind, junctions, workers=2, steps=wanted.steps).result())
     first = {row["junctions"]: row for row in rows if row["kind"] == wanted.grids[0]}
     small, large = min(first), max(first)

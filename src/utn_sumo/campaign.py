@@ -6,14 +6,13 @@ import os
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from utn_sumo import bridge
+from utn_sumo import bridge, processes
 from utn_sumo.errors import SettingError, UtnError
 from utn_sumo.scenario import scenario
 
@@ -65,7 +64,7 @@ def seeds(text: str) -> list[int]:
 def _alone(job: Job) -> dict[str, Any]:
     # The process inherits the mask: a Ctrl-C ends its run, and is silent before and after it.
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP)
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+    with processes.pool(1) as process:
         try:
             return process.submit(_outcome, dict(job)).result()
         except BrokenProcessPool:

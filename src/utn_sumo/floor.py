@@ -11,16 +11,14 @@ arrive in each control step, but nobody's mind.
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from utn_sumo import demand, recording
+from utn_sumo import demand, processes, recording
 from utn_sumo.contract import Floats, Network, Plan
 from utn_sumo.plant.sumo import SumoPlant
 
@@ -34,7 +32,7 @@ def spread(network: Network, folder: Path, cuts: Sequence[int], replicas: int, h
     processors.
     """
     jobs = [(network, folder, cut, replica, horizon) for cut in cuts for replica in range(replicas)]
-    with ProcessPoolExecutor(os.cpu_count(), max_tasks_per_child=1) as pool:
+    with processes.pool(afresh=True) as pool:
         futures = np.array(list(pool.map(_replica, jobs)))
     by_cut = futures.reshape(len(cuts), replicas, horizon, -1)
     return np.asarray(np.sqrt(np.mean(np.var(by_cut, axis=1, ddof=1), axis=0)))

@@ -40,7 +40,7 @@ from typing import Any
 
 import numpy as np
 
-from utn_sumo import bridge, controllers, demand, fitted, network, plots, recording
+from utn_sumo import bridge, controllers, demand, fitted, network, plots, processes, recording
 from utn_sumo.contract import EXIT, Forecast, Network, State
 from utn_sumo.plant.macroscopic import MacroscopicPlant, Passed
 from utn_sumo.prediction import Predictor
@@ -161,12 +161,16 @@ def study(todo: Sequence[Run], folder: Path, tick: Callable[[], None]) -> list[d
     if not outside:
         return results
     jobs = [(run.scenario, folder / "runs" / run.name) for run in outside]
-    # Ctrl-C is for this process alone, which ends the others as it leaves the pool.
-    ignoring = (signal.SIGINT, signal.SIG_IGN)
-    with multiprocessing.get_context("spawn").Pool(os.cpu_count(), signal.signal, ignoring, maxtasksperchild=1) as pool:
+    with multiprocessing.get_context("spawn").Pool(os.cpu_count(), _begin, maxtasksperchild=1) as pool:
         for run, (_, path), result in zip(outside, jobs, pool.imap(_in_sumo, jobs), strict=True):
             finish(run, {**result, "unfit_cycles": result["fallbacks"]}, recording.read_log(path))
     return results
+
+
+def _begin() -> None:
+    # Ctrl-C is for the process that started this one alone, which ends the others as it leaves the pool.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    processes.end_with_parent()
 
 
 def _in_sumo(job: tuple[Scenario, Path]) -> dict[str, Any]:

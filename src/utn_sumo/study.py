@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from utn_sumo import bridge, calibration, floor, forecast_report, mismatch, plots, recording, streets
+from utn_sumo import bridge, calibration, floor, forecast_report, mismatch, plots, processes, recording, streets
 from utn_sumo.errors import SettingError
 from utn_sumo.model import check_step
 from utn_sumo.recording import Log
@@ -26,7 +23,7 @@ INPUTS = ("known", "forecast")
 def record(scenarios: Sequence[Scenario], folder: Path, tick: Callable[[], None]) -> list[Path]:
     """Run the scenarios in parallel processes and return their result folders; `tick` is called after each."""
     jobs = [(item, folder / "runs" / f"demand{item.demand:g}-seed{item.seed}") for item in scenarios]
-    with ProcessPoolExecutor(os.cpu_count(), max_tasks_per_child=1) as pool:
+    with processes.pool(afresh=True) as pool:
         for _ in pool.map(_record, jobs):
             tick()
     return [path for _, path in jobs]
@@ -101,7 +98,7 @@ def study_forecasts(
     """Errors of the forecasts over recorded runs, as `forecast_report.summary` gives them; a plot into `folder`."""
     jobs = [(path, horizon, refit_steps) for path in folders]
     runs = []
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
+    with processes.pool() as pool:
         for found in pool.map(_judge, jobs):
             runs.append(found)
             tick()
