@@ -18,7 +18,7 @@ from utn_sumo.contract import Ints, Junction, Network, Plan, State, View
 class ActuatedSettings(BaseModel):
     """Settings of the execution `actuated`."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
     gap_s: float = Field(2.0, gt=0, le=60)
     """Time without a vehicle at the stop line that ends a green [s]. Of 1.5, 2, 2.5, 3 and 4 the one with least delay

@@ -68,7 +68,7 @@ class _Best:
 class WaveSettings(BaseModel):
     """Settings of `max_wave`."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
     every_s: float = Field(5.0, ge=1, le=60)
     """Time between two decisions [s]."""

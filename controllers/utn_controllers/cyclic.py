@@ -20,7 +20,7 @@ from utn_sumo.contract import EXIT, Floats, Forecast, Network, Plan, State
 class SplitSettings(BaseModel):
     """Settings of `proportional`."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
     count: Literal["queue", "vehicles"] = "vehicles"
     """What is shared out by: who stands when the step begins, or all on the link. The first is common, but the queue

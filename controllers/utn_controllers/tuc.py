@@ -19,7 +19,7 @@ RANK = 1e-9
 class Settings(BaseModel):
     """Settings of `tuc`."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     r: float = Field(0.01, ge=1e-6, le=1e3)
     """R = r I: weight of the greens [s] squared, beside the vehicles squared over the storage. To be found by trial

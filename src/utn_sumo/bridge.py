@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import platform
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-import utn_sumo
 from utn_sumo import (
     calibration,
     controllers,
@@ -32,7 +29,7 @@ from utn_sumo.contract import Floats, Network
 from utn_sumo.detectors import Miscount
 from utn_sumo.errors import SettingError
 from utn_sumo.estimation import Estimator
-from utn_sumo.plant.sumo import SumoPlant
+from utn_sumo.plant.sumo import LOG, SumoPlant
 from utn_sumo.plant.untouched import Look
 from utn_sumo.prediction import Predictor
 from utn_sumo.scenario import Scenario
@@ -73,7 +70,7 @@ def run(
         duration_s = chosen.end_s - chosen.begin_s
     steps = int(np.ceil(duration_s / step_s))
     driving = chosen or traffic.drawn(scenario, net)
-    folder = recording.new_folder(folder, _default_name(scenario))
+    folder = recording.new_folder(folder, scenario.name)
     driving = _kept(driving, net, folder)
     predictor = _predictor(net, scenario, driving, steps)
     # Of other people's vehicles some start amid links, and nobody says how many.
@@ -137,6 +134,7 @@ def run(
         "max_vehicles_veh": tally.max_vehicles_veh,
         "over_storage_veh": tally.over_storage_veh(net.storage_veh),
         "teleports": metrics.teleports(folder / "statistics.xml"),
+        "left_out_veh": metrics.left_out_veh(folder / LOG),
         "gridlock": metrics.gridlocked(net, tally.x_veh, tally.left_veh, greens.by_turn_s(tally.ends_s)),
         "longest_red_s": greens.longest_wait_s(plant.waiting),
         "unsafe_signal_s": verdict.unsafe_signal_s,
@@ -231,33 +229,14 @@ class _Tally:
         return float(np.max(np.array(self._max_x_veh) - storage_veh, initial=0.0))
 
 
-def _default_name(scenario: Scenario) -> str:
-    net, controller = (
-        Path(part.partition(":")[0]).name.partition(".")[0] for part in (scenario.net, scenario.controller)
-    )
-    if scenario.execution is not None:
-        controller += f"-{Path(scenario.execution.partition(':')[0]).name.partition('.')[0]}"
-    return f"{net}-{controller}-demand{scenario.demand:g}-seed{scenario.seed}"
-
-
 def _kept(driving: Path | Case, net: Network, folder: Path) -> Path | Case:
     """What the run is made from, as its folder keeps it."""
     if isinstance(driving, Case):
         return quiet.silenced(driving, folder)
-    shutil.copyfile(net.net_file, folder / "net.net.xml")
-    return Path(shutil.copyfile(driving, folder / "routes.rou.xml"))
+    shutil.copyfile(net.net_file, folder / recording.NET)
+    return Path(shutil.copyfile(driving, folder / recording.ROUTES))
 
 
 def _settings(scenario: Scenario, driving: Path | Case, sumo: str) -> dict[str, Any]:
     brought = {"case": driving.record()} if isinstance(driving, Case) else {}
-    return {"scenario": scenario.model_dump(), **brought, "versions": _versions(sumo)}
-
-
-def _versions(sumo: str) -> dict[str, str]:
-    packages = ("libsumo", "sumolib", "casadi", "daqp", "numpy")
-    return {
-        "utn_sumo": utn_sumo.__version__,
-        "sumo": sumo,
-        "python": platform.python_version(),
-        **{package: version(package) for package in packages},
-    }
+    return {"scenario": scenario.model_dump(), **brought, "versions": recording.versions(sumo)}

@@ -173,15 +173,19 @@ def applied(network: Network, path: Path) -> Network:
     """The network with the parameters of a calibration file. Raises NetworkError if it does not fit the network."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise NetworkError(f"calibration {str(path)!r} can't be read ({error}): make one with utn calibrate") from error
+    try:
         links = tuple(replace(link, **_values(content["links"][link.id])) for link in network.links)
         turns = tuple(
             replace(turn, fraction=float(content["links"][network.links[turn.link].id]["turns"][turn.to_edge][0]))
             for turn in network.turns
         )
         lag_s = float(content["startup_lag_s"][0])
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, IndexError) as error:
         raise NetworkError(
-            f"calibration {str(path)!r} does not fit net {network.name!r} ({error}): make one with utn calibrate"
+            f"calibration {str(path)!r} does not fit net {network.name!r} (lacks or misplaces {error}): make one with "
+            "utn calibrate"
         ) from error
     return replace(network, links=links, turns=turns, startup_lag_s=lag_s)
 

@@ -231,7 +231,7 @@ def _files(path: Path, name: str, text: str) -> tuple[Path, ...]:
     for each in found:
         if not each.is_file():
             what = "that is a folder" if each.is_dir() else "there is no such file"
-            raise SettingError(f"scenario {str(path)!r} names {str(each)!r} as {name}: {what}")
+            raise SettingError(f"scenario {str(path)!r} names {str(each)!r} as {name}: {what}, mend its path")
         for _ in elements(each, name):
             pass
     return found

@@ -147,18 +147,19 @@ def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: s
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
 def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, as_json: bool, **flags: Any) -> None:
     """Measure the forecasts' errors by method on the recorded runs in FOLDERS, or on runs made for it."""
+    from utn_sumo import forecast_report as judging  # noqa: PLC0415 - heavy
     from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
     from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy
 
     steps, refit_steps = (_whole(name, flags.pop(name)) for name in ("horizon", "refit_steps"))
     items = [] if folders else [scenario(**flags, seed=seed) for seed in range(1, 1 + _whole("seeds", seeds))]
-    if len(folders or items) < 2:  # noqa: PLR2004 - an interval needs two
-        raise SettingError("forecasts are judged over runs: give two or more, as --seeds 2 or as folders")
     for path in folders:
         recording.read_json(path, recording.SETTINGS)
+    if len(folders or items) < 2:  # noqa: PLR2004 - an interval needs two
+        raise SettingError("forecasts are judged over runs: give two or more, as --seeds 2 or as folders")
     folder = recording.new_folder(out, "forecast-report")
     with report.counter("runs and forecasts", len(items) + len(folders or items)) as tick:
-        runs = folders or study.record(items, folder, tick)
+        runs = folders or study.record(items, folder, tick, judging.FIRST_STEP + steps + 1)
         result = study.study_forecasts(runs, folder, horizon=steps, refit_steps=refit_steps, tick=tick)
     recording.write_json(folder / "forecasts.json", result)
     click.echo(json.dumps(recording.plain(result))) if as_json else report.forecast_table(result, folder)
@@ -302,19 +303,12 @@ def replay(folder: Path) -> None:
 
 
 @cli.command()
-def controllers() -> None:
-    """List the registered controllers and executions, and their settings."""
-    from utn_sumo.controllers import CONTROLLER, EXECUTION, registered, settings_of  # noqa: PLC0415 - heavy
+@click.argument("name", required=False)
+def controllers(name: str | None) -> None:
+    """List the registered controllers and executions, or tell what the settings of NAME mean."""
+    from utn_sumo import manual, report  # noqa: PLC0415 - heavy
 
-    for kind in (CONTROLLER, EXECUTION):
-        click.echo(f"{kind.noun}s")
-        for name, point in registered(kind).items():
-            factory = point.load()
-            click.echo(f"  {name}: {(factory.__doc__ or '').strip().splitlines()[0]}")
-            names = settings_of(factory)
-            click.echo(f"      settings: {', '.join(names) if names else 'none'}")
-        for name, told in kind.others.items():
-            click.echo(f"  {name}: {told}")
+    report.manual_tables(manual.entries(name), whole=name is not None)
 
 
 @cli.group()
@@ -404,6 +398,9 @@ def main(arguments: list[str] | None = None) -> None:
     except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("utn: stopped; what was reached is on disk", err=True)
         sys.exit(130)
+    except OSError as error:
+        # Of files that are ours to read all errors are told where they are read: this is a disk, or a pipe's end.
+        _fail(f"{str(error.filename or 'output')!r} can't be used ({error.strerror}): free it, or name another")
 
 
 def _fail(line: str) -> None:

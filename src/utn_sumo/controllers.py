@@ -61,6 +61,8 @@ def registered(kind: Kind = CONTROLLER) -> dict[str, EntryPoint]:
 def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
     """The controller called `name`, built for `network`. Raises ControllerError or SettingError."""
     found: Controller = _built(CONTROLLER, name, network, settings)
+    if not isinstance(found.horizon, int) or found.horizon < 1:
+        raise ControllerError(f"controller {name!r} has horizon {found.horizon!r}: make it a whole number from 1 on")
     return found
 
 
@@ -119,7 +121,7 @@ def made(name: str, factory: Callable[..., T], settings: dict[str, Any], *given:
         raise SettingError(f"{noun} {name!r}: {explain(error, takes)}") from error
     except UtnError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ControllerError(f"{noun} {name!r} can't be built: {_told(error)}") from error
 
 
@@ -150,7 +152,7 @@ def _from_file(kind: Kind, name: str) -> Any:
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[spec.name]
         raise ControllerError(f"{kind.noun} {name!r}: {path!r} can't be loaded: {_told(error)}") from error
     if not hasattr(module, attribute):
@@ -158,6 +160,6 @@ def _from_file(kind: Kind, name: str) -> Any:
     return getattr(module, attribute)
 
 
-def _told(error: Exception) -> str:
+def _told(error: BaseException) -> str:
     """What a user's own code raised, in one line: the kind, the text, the line of their file where there is one."""
     return " ".join(f"{type(error).__name__}: {error}".split())

@@ -47,7 +47,7 @@ def _replica(job: tuple[Network, Path, int, int, int]) -> Floats:
     step_s = network.control_step_s
     with tempfile.TemporaryDirectory() as temporary:
         routes = Path(temporary) / "routes.rou.xml"
-        _redraw_departures(network, folder / "routes.rou.xml", routes, cut * step_s, rng)
+        _redraw_departures(network, folder / recording.ROUTES, routes, cut * step_s, rng)
         ahead = []
         end_s = (cut + horizon) * step_s
         with SumoPlant(network, routes, Path(temporary), seed=seed, duration_s=end_s) as plant:

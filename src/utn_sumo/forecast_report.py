@@ -46,7 +46,7 @@ def rmse_veh_h(folder: Path, horizon: int, refit_steps: int) -> dict[str, list[f
             f"setting 'hours' is {scenario.hours:g}: forecasts are judged in runs of {least} control steps and more,"
             f" {least * net.control_step_s / 3600:.2g} h"
         )
-    coming = demand.coming_veh(net, folder / "routes.rou.xml", steps)
+    coming = demand.coming_veh(net, folder / recording.ROUTES, steps)
     mean_veh_h = demand.mean_profile_veh_h(net, scenario.profile, steps, scenario.demand)
     found = {}
     for method in METHODS:

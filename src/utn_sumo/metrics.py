@@ -58,6 +58,12 @@ def teleports(statistics: Path) -> int:
     return int(element.attrib["total"]) if element is not None else 0
 
 
+def left_out_veh(log: Path) -> int:
+    """Vehicles that SUMO left out since their routes are not in the order of their departures, by its error log."""
+    text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""
+    return text.count("sorted by departure time, ignoring")
+
+
 GRIDLOCK_STEPS = 3
 GRIDLOCK_OCCUPANCY = 0.5
 GRIDLOCK_DISCHARGE = 0.1

@@ -5,6 +5,7 @@ Nothing is added to it but records, so that the trips are those of the bare `sum
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,13 +17,11 @@ from utn_sumo.case import SUFFIX, Case
 from utn_sumo.contract import Network
 from utn_sumo.errors import UtnError
 from utn_sumo.plant import untouched
-from utn_sumo.plant.sumo import records, write_outputs
+from utn_sumo.plant.sumo import LOG, records, write_outputs
 from utn_sumo.plant.untouched import Look
 from utn_sumo.scenario import Scenario
 
 NAME = "native"
-PROGRAMMES = "programmes.add.xml"
-"""Signal programmes that stand for the net's own, in a run's folder."""
 
 
 def run(
@@ -57,17 +56,16 @@ def measured(
     roads are. Raises UtnError.
     """
     started = time.perf_counter()
-    name = f"{Path(scenario.net).name.partition('.')[0]}-{scenario.controller}-seed{scenario.seed}"
-    folder = recording.new_folder(folder, name)
-    chosen = quiet.silenced(chosen, folder)
+    folder = recording.new_folder(folder, scenario.name)
+    brought = scenario.net.endswith(SUFFIX)
+    chosen = quiet.silenced(chosen, folder) if brought else _kept(chosen, folder)
     if programmes is not None:
-        added = folder / PROGRAMMES
+        added = folder / recording.PROGRAMMES
         added.write_text(programmes, encoding="utf-8")
         chosen = replace(chosen, additional_files=(*chosen.additional_files, added))
-    recording.write_json(
-        folder / recording.SETTINGS,
-        {"scenario": scenario.model_dump(), "case": chosen.record()},
-    )
+    case = {"case": chosen.record()} if brought else {}
+    settings = {"scenario": scenario.model_dump(), **case, "versions": recording.versions(untouched.version())}
+    recording.write_json(folder / recording.SETTINGS, settings)
     outputs = folder / "outputs.add.xml"
     write_outputs(outputs)
 
@@ -76,7 +74,11 @@ def measured(
             on_look(seen.time_s - chosen.begin_s, (chosen.end_s or chosen.begin_s) - chosen.begin_s, seen)
 
     outcome = untouched.run(
-        [*chosen.arguments([outputs]), *records(folder, scenario.seed)], chosen.begin_s, chosen.end_s, look
+        [*chosen.arguments([outputs]), *records(folder, scenario.seed)],
+        chosen.begin_s,
+        chosen.end_s,
+        folder / LOG,
+        look,
     )
     verdict = judged and monitor.watch(judged, folder / "signals.xml", outcome.end_s - chosen.begin_s, chosen.begin_s)
     result = {
@@ -91,6 +93,7 @@ def measured(
         "max_vehicles_veh": outcome.max_vehicles_veh,
         "over_storage_veh": None,
         "teleports": metrics.teleports(folder / "statistics.xml"),
+        "left_out_veh": metrics.left_out_veh(folder / LOG),
         "gridlock": None,
         "longest_red_s": None,
         "unsafe_signal_s": verdict and verdict.unsafe_signal_s,
@@ -109,12 +112,20 @@ def measured(
     return result
 
 
+def _kept(chosen: Case, folder: Path) -> Case:
+    """A case of our own demand, with copies of its files in the run's folder."""
+    (routes,) = chosen.route_files
+    net = Path(shutil.copyfile(chosen.net_file, folder / recording.NET))
+    kept = Path(shutil.copyfile(routes, folder / recording.ROUTES))
+    return replace(chosen, file=net, net_file=net, route_files=(kept,))
+
+
 def of(scenario: Scenario) -> Case:
     """The scenario's net and traffic: of a .sumocfg its own, else a net with demand drawn as for every controller."""
     if scenario.net.endswith(SUFFIX):
         return traffic.given(scenario)
     net = streets.named(scenario.net)
-    options = (("time-to-teleport", "-1"), ("max-depart-delay", "-1"))
+    options = (("time-to-teleport", "-1"), ("max-depart-delay", "-1"), ("collision.action", "warn"))
     return Case(
         net.net_file, net.net_file, (traffic.drawn(scenario, net),), (), 0.0, scenario.duration_s, -1.0, options
     )

@@ -4,7 +4,9 @@ settings.json   scenario, versions
 cycles.jsonl    one object per control step: measurement, state, forecast, plan, who it came from, SUMO's truth
 trips.xml       SUMO's tripinfo, unfinished and undeparted vehicles included
 signals.xml     every signal switch
-routes.rou.xml, net.net.xml   what the run was made from, so that the folder is complete in itself
+routes.rou.xml, net.net.xml   what the run was made from, so that the folder is complete in itself, where the traffic is
+                ours; of a .sumocfg the settings name the files
+programmes.add.xml   the signal programmes of SUMO's own controllers
 result.json     the measures of SPEC 7
 """
 
@@ -15,35 +17,43 @@ import functools
 import itertools
 import json
 import math
+import platform
+import tempfile
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from types import NoneType
 from typing import Any
 
 import numpy as np
 
+import utn_sumo
 from utn_sumo.contract import Floats
 from utn_sumo.errors import ResultError
 
 SETTINGS, CYCLES, RESULT = "settings.json", "cycles.jsonl", "result.json"
+NET, ROUTES, PROGRAMMES = "net.net.xml", "routes.rou.xml", "programmes.add.xml"
 
 
 def new_folder(path: Path | None, default_name: str) -> Path:
     """Make and return the folder for a run's results; `results/<default name>[-n]` if none is named.
 
-    Raises ResultError if the named folder holds anything: results are never overwritten.
+    Raises ResultError if the named folder holds anything, since nothing is ever overwritten, or can't be written to.
     """
     if path is None:
         return _numbered(Path("results"), default_name)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise ResultError(
-            f"output folder {str(path)!r} exists and holds results: name another with --out, or remove it"
-        )
     try:
+        if path.exists() and not path.is_dir():
+            raise ResultError(f"output folder {str(path)!r} is a file: name another with --out")
+        if path.is_dir() and any(path.iterdir()):
+            raise ResultError(f"output folder {str(path)!r} is not empty: name another with --out")
         path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            return path
     except OSError as error:
-        raise ResultError(f"output folder {str(path)!r} can't be made ({error.strerror}): name another") from error
-    return path
+        raise ResultError(
+            f"output folder {str(path)!r} can't be written to ({error.strerror}): name another with --out"
+        ) from error
 
 
 def _numbered(base: Path, name: str) -> Path:
@@ -92,6 +102,17 @@ def read_json(folder: Path, name: str) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ResultError(f"{str(folder)!r} holds no readable {name}: give a folder that `utn run` wrote") from error
     return dict(content)
+
+
+def versions(sumo: str) -> dict[str, str]:
+    """What a run was made with, SUMO of this version beside it."""
+    packages = ("libsumo", "sumolib", "casadi", "daqp", "numpy")
+    return {
+        "utn_sumo": utn_sumo.__version__,
+        "sumo": sumo,
+        "python": platform.python_version(),
+        **{package: version(package) for package in packages},
+    }
 
 
 def plain(value: Any) -> Any:

@@ -38,7 +38,7 @@ def write(folder: Path) -> Path:
         raise ResultError(f"{str(folder)!r} lacks a run's seed or length: give one that `utn run` wrote") from error
     if chosen is not None:
         _check_files(folder, settings["case"])
-    elif not (folder / "routes.rou.xml").is_file():
+    elif not (folder / recording.ROUTES).is_file():
         raise ResultError(f"{str(folder)!r} holds no routes: give a folder that `utn run` wrote")
     target = folder / FOLDER
     if target.exists():
@@ -53,10 +53,11 @@ def write(folder: Path) -> Path:
     shown = {junction: each for junction, each in switches.items() if junction not in left_alone}
     _write_programmes(signals, shown, begin_s, begin_s + duration_s)
     if chosen is None:
+        above, programmes = Path(".."), folder / recording.PROGRAMMES
         arguments = run_arguments(
-            Path("../net.net.xml"),
-            Path("../routes.rou.xml"),
-            [Path(signals.name)],
+            above / recording.NET,
+            above / recording.ROUTES,
+            [*([above / programmes.name] if programmes.is_file() else []), Path(signals.name)],
             Path(),
             seed=seed,
             duration_s=duration_s,

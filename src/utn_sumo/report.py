@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from rich.table import Table
 
 from utn_sumo import recording
 from utn_sumo.bridge import Progress as RunProgress
+from utn_sumo.manual import Entry
 from utn_sumo.scenario import Scenario
 
 FLOOR_LIMIT = 1.5
@@ -68,12 +70,12 @@ def progress(scenario: Scenario) -> Iterator[Callable[[RunProgress], None]]:
         TextColumn("{task.fields[state]}"),
     )
     bar = Progress(*columns, console=Console(stderr=True))
-    task = bar.add_task(f"{scenario.controller} on {scenario.net}", total=scenario.duration_s, state="")
+    task = bar.add_task(f"{scenario.controller} on {scenario.net}", total=None, state="")
 
     def show(now: RunProgress) -> None:
         bar.start()
         state = f"TTS {now.time_spent_veh_h:.0f} veh h, queue {now.queue_veh:.0f} veh"
-        bar.update(task, completed=now.time_s, state=state)
+        bar.update(task, completed=now.time_s, total=now.duration_s or None, state=state)
 
     try:
         yield show
@@ -98,9 +100,33 @@ def table(result: dict[str, Any]) -> None:
         console.print(_window(brought), highlight=False)
     for reason in [*result.get("unsafe_reasons", []), *result.get("fallback_reasons", [])]:
         console.print(f"  ! {reason}", markup=False)
+    if result["left_out_veh"]:
+        number = result["left_out_veh"]
+        console.print(f"  ! SUMO left out {number} vehicles: sort their routes by departure", markup=False)
     if result["interrupted"]:
         console.print("stopped before its end: the measures cover the time that was run")
     console.print(f"results: {result['out']}", markup=False)
+
+
+def manual_tables(entries: Sequence[Entry], *, whole: bool) -> None:
+    """Controllers and executions with their settings: by name alone, or as a `whole` with what these mean."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    noun = ""
+    for each in entries:
+        if each.noun != noun:
+            noun = each.noun
+            console.print(f"{noun}s", markup=False, highlight=False)
+        console.print(f"  {each.name}: {each.does}", markup=False, highlight=False)
+        if whole and each.settings:
+            view = Table("setting", "default", "may be", "what it is")
+            for setting in each.settings:
+                view.add_row(*(escape(text) for text in dataclasses.astuple(setting)))
+            console.print(view)
+        else:
+            told = ", ".join(f"{setting.name}={setting.default}" for setting in each.settings) or "none"
+            console.print(f"      settings: {told}", markup=False, highlight=False, soft_wrap=True)
+    if not whole:
+        console.print("utn controllers NAME tells what its settings mean", highlight=False)
 
 
 def _window(brought: dict[str, Any]) -> str:

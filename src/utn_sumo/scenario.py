@@ -73,6 +73,13 @@ class Scenario(BaseModel):
         return table
 
     @property
+    def name(self) -> str:
+        """What its results are called by default: net, controller and execution, demand, seed."""
+        parts = [self.net, self.controller, *([] if self.execution is None else [self.execution])]
+        names = [Path(part.partition(":")[0]).name.partition(".")[0] for part in parts]
+        return f"{'-'.join(names)}-demand{self.demand:g}-seed{self.seed}"
+
+    @property
     def duration_s(self) -> float:
         return round(self.hours * 3600)
 

@@ -131,7 +131,9 @@ def space(controller: str, over: Sequence[str] = (), execution: str | None = Non
         models |= _model(EXECUTION, execution, OF_EXECUTION)
     fields = _fields(models)
     if not fields:
-        raise SettingError(f"{whose} has no pydantic `Settings`: there is nothing to search")
+        raise SettingError(
+            f"{whose} has no settings that say what they may be: give its class `Settings`, a pydantic model"
+        )
     if not over:
         own = {name: _own(each) for name, each in fields.items()}
         ranges: dict[str, Range | Choice] = {name: each for name, each in own.items() if isinstance(each, Range)}

@@ -9,7 +9,20 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from utn_sumo import bridge, calibration, floor, forecast_report, mismatch, plots, processes, recording, streets
+from utn_sumo import (
+    bridge,
+    calibration,
+    floor,
+    forecast_report,
+    mismatch,
+    plots,
+    processes,
+    recording,
+    streets,
+    sumo_signals,
+    traffic,
+)
+from utn_sumo.case import SUFFIX
 from utn_sumo.errors import SettingError
 from utn_sumo.model import check_step
 from utn_sumo.recording import Log
@@ -20,8 +33,13 @@ FLOOR_REPLICAS = 6
 INPUTS = ("known", "forecast")
 
 
-def record(scenarios: Sequence[Scenario], folder: Path, tick: Callable[[], None]) -> list[Path]:
-    """Run the scenarios in parallel processes and return their result folders; `tick` is called after each."""
+def record(scenarios: Sequence[Scenario], folder: Path, tick: Callable[[], None], least_steps: int = 1) -> list[Path]:
+    """Run the scenarios in parallel processes and return their result folders; `tick` is called after each.
+
+    Raises SettingError before any if they will have no record of control steps, or fewer than `least_steps`.
+    """
+    for item in scenarios:
+        _check(item, least_steps)
     jobs = [(item, folder / "runs" / f"demand{item.demand:g}-seed{item.seed}") for item in scenarios]
     with processes.pool(afresh=True) as pool:
         for _ in pool.map(_record, jobs):
@@ -31,6 +49,24 @@ def record(scenarios: Sequence[Scenario], folder: Path, tick: Callable[[], None]
 
 def _record(job: tuple[Scenario, Path]) -> None:
     bridge.run(*job)
+
+
+def _check(item: Scenario, least_steps: int) -> None:
+    if item.controller in sumo_signals.RUNS:
+        raise SettingError(
+            f"setting 'controller' is {item.controller!r}: SUMO switches its signals, and no control step is on "
+            "record: name one that plans, as dmpc"
+        )
+    duration_s: float | None = item.duration_s
+    if item.net.endswith(SUFFIX):
+        chosen = traffic.given(item)
+        duration_s = None if chosen.end_s is None else chosen.end_s - chosen.begin_s
+    step_s = streets.named(item.net).control_step_s
+    if duration_s is not None and np.ceil(duration_s / step_s) < least_steps:
+        raise SettingError(
+            f"setting 'hours' gives runs of {duration_s / 3600:.3g} h: make them {least_steps} control steps or more, "
+            f"{np.ceil(least_steps * step_s / 36) / 100:g} h"
+        )
 
 
 def study_mismatch(
@@ -61,11 +97,11 @@ def study_mismatch(
     results = []
     for demand in demands:
         items = [scenario(**base, demand=demand, seed=seed) for seed in seeds]
-        folders = record(items, folder, tick)
+        folders = record(items, folder, tick, horizon + 2)
         log = Log.stack([recording.read_log(path) for path in folders])
         if len(log.green_s) <= horizon + 1:
             raise SettingError(
-                f"setting 'hours' gives runs of {len(log.green_s)} control steps: make them more than {horizon + 1}"
+                f"the runs were over after {len(log.green_s)} control steps: make them more than {horizon + 1}"
             )
         floor_veh = None
         if with_floor:
@@ -136,7 +172,7 @@ def study_calibration(
     step_s = whole.sample_s if step_s is None else step_s
     check_step(whole, step_s)
     items = [scenario(**base, demand=demand, seed=seed) for demand in demands for seed in seeds]
-    log = Log.stack([recording.read_log(path) for path in record(items, folder, tick)])
+    log = Log.stack([recording.read_log(path) for path in record(items, folder, tick, calibration.HORIZON + 2)])
     fitted = calibration.calibrate(whole, log, step_s)
     made = {
         "step_s": step_s,

@@ -24,7 +24,7 @@ from utn_sumo.scenario import Scenario
 class Peer(BaseModel, ABC):
     """One of them, with its settings."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     min_green_s: int = Field(5, ge=1, le=120)
     """Least green of a stage for which the net names none (`minDur`): netconvert's `tls.min-dur`."""
@@ -53,6 +53,7 @@ class DelayBased(Peer):
     """SUMO's delay_based signals: a green goes on while vehicles that have lost time come nearer."""
 
     max_green_s: int = Field(50, ge=1, le=3600)
+    """Netconvert's `tls.max-dur`."""
     detector_range_m: float = Field(100.0, gt=0, le=10_000)
     """How far upstream vehicles are seen: SUMO's default."""
     min_time_loss_s: float = Field(1.0, ge=0, le=3600)
@@ -71,6 +72,7 @@ class Webster(Peer):
     min_cycle_s: int = Field(50, ge=1, le=3600)
     """The tool's own least is 20 s, too short for most nets."""
     max_cycle_s: int = Field(120, ge=1, le=3600)
+    """The tool's own most is 120 s too."""
     lost_time_s: int = Field(6, ge=0, le=60)
     """Of a stage, by start-up and clearance. The tool's 4 s make cycles too short: with 6 s there is up to 29 % less
     delay on `utn17`, cologne8 and ingolstadt7."""

@@ -46,7 +46,7 @@ class Supervisor:
             wish = self.controller.plan(state, forecast)
             plan = signals.admit(wish, self.network)
             ahead = [] if wish.ahead_s is None else [Plan(green_s) for green_s in wish.ahead_s]
-        except Exception as error:  # noqa: BLE001 - a foreign controller may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a foreign controller may raise anything
             reason = f"{type(error).__name__}: {error}"
         else:
             self._ahead = ahead

@@ -9,8 +9,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import pytest
+
+from utn_sumo import sumo_tools
 
 Utn = Callable[..., subprocess.CompletedProcess[str]]
 SHORT = ("run", "--controller", "fixed", "--hours", "0.1")
@@ -181,6 +184,8 @@ def test_a_scenario_file_says_what_flags_say_and_flags_win(utn: Utn, folder: Pat
         (("replay", "--help"), ["FOLDER"]),
         (("net", "--help"), ["build", "check"]),
         (("--version",), ["utn"]),
+        (("controllers", "scheduled"), ["blocking", "4.0", "number, from 0 on, up to 20", "behind"]),
+        (("controllers", "fixed"), ["fixed", "settings: none"]),
         (("controllers",), ["fixed", "dmpc", "horizon", "settings: none", "executions", "exact", "gap_s"]),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
@@ -209,6 +214,51 @@ def test_replay_writes_a_configuration_that_sumo_runs_and_refuses_to_write_it_tw
     before = configuration.read_bytes()
     assert "remove it" in one_line(utn("replay", "out"))
     assert configuration.read_bytes() == before
+
+
+@pytest.mark.parametrize("controller", ["native", "actuated"])
+def test_runs_of_sumo_alone_are_kept_whole_too(utn: Utn, folder: Path, controller: str) -> None:
+    assert utn("run", "--controller", controller, "--hours", "0.1", "--demand", "0.5").returncode == 0
+    out = folder / "results" / f"utn17-{controller}-demand0.5-seed1"
+    settings = json.loads((out / "settings.json").read_text(encoding="utf-8"))
+    assert settings["versions"].keys() >= {"utn_sumo", "sumo"}
+    # The folder is enough, wherever it is and whatever becomes of the rest.
+    moved = folder / "elsewhere"
+    out.rename(moved)
+    assert utn("replay", "elsewhere").returncode == 0
+    subprocess.run([sumo_tools.sumo_binary("sumo"), "-c", "run.sumocfg"], cwd=moved / "replay", check=True)
+    assert trips(moved / "replay" / "trips.xml") == trips(moved / "trips.xml")
+
+
+def trips(file: Path) -> list[dict[str, str]]:
+    return [trip.attrib for trip in ET.parse(file).getroot().iter("tripinfo")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("run", "--out", "file"), ["'file'", "is a file", "--out"]),
+        (("run", "--out", "."), ["'.'", "is not empty", "--out"]),
+        (
+            ("mismatch", "--hours", "0.2", "--no-floor", "--out", "new"),
+            ["'hours'", "0.2 h", "9 control steps", "0.3 h"],
+        ),
+        (("calibrate", "--controller", "native", "--out", "new"), ["'controller'", "'native'", "one that plans"]),
+        (("run", "--calibration", "nowhere.json"), ["'nowhere.json'", "can't be read", "utn calibrate"]),
+        (("run", "--net", "routes.xml"), ["'routes.xml'", "holds no roads", "netconvert"]),
+        (("forecast-report", "nowhere"), ["'nowhere'", "settings.json"]),
+    ],
+    ids=lambda value: " ".join(value[:3]) if isinstance(value, tuple) else "",
+)
+def test_what_cannot_be_is_said_before_anything_is_run(
+    utn: Utn, folder: Path, arguments: tuple[str, ...], words: list[str]
+) -> None:
+    (folder / "file").touch()
+    (folder / "routes.xml").write_text("<routes/>", encoding="utf-8")
+    line = one_line(utn(*arguments))
+    assert [word for word in words if word not in line] == []
+    # Another try may have the same folder.
+    assert not (folder / "new").exists() or not any((folder / "new").iterdir())
 
 
 @pytest.fixture

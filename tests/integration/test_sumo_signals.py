@@ -15,7 +15,7 @@ import pytest
 from utn_sumo import bridge, controllers, monitor, replay, sumo_tools
 from utn_sumo.contract import Network
 from utn_sumo.errors import ControllerError, PlantError, SettingError, UtnError
-from utn_sumo.native import PROGRAMMES
+from utn_sumo.recording import PROGRAMMES
 from utn_sumo.scenario import scenario
 from utn_sumo.sumo_signals import PEERS
 from utn_sumo.sumo_tools import sumo_binary

@@ -187,3 +187,16 @@ def test_of_a_file_that_can_not_be_loaded_nothing_is_left(tmp_path: Path, utn17:
     before = set(sys.modules)
     assert "can't be loaded: RuntimeError: not today" in complaint(utn17, f"{path}:Mine")
     assert set(sys.modules) == before
+
+
+@pytest.mark.parametrize("horizon", ["x", 0, 1.5, None])
+def test_a_horizon_that_is_no_number_of_cycles_is_named(utn17: Network, tmp_path: Path, horizon: object) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(OWN.replace("horizon = 3", f"horizon = {horizon!r}"), encoding="utf-8")
+    assert f"has horizon {horizon!r}: make it a whole number from 1 on" in complaint(utn17, f"{file}:Mine")
+
+
+def test_a_file_that_ends_the_process_cannot_be_loaded(utn17: Network, tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("raise SystemExit(3)\n", encoding="utf-8")
+    assert "can't be loaded: SystemExit: 3" in complaint(utn17, f"{file}:Mine")

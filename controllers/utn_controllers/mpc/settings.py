@@ -13,7 +13,7 @@ RHO = {"tts": 0.2, "paper": 0.6}
 class ProblemSettings(BaseModel):
     """What states the problem, whoever solves it; every field is checked when the controller is built."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     horizon: int = Field(7, ge=1, le=60)
     """Kp, control steps predicted."""
@@ -25,6 +25,7 @@ class ProblemSettings(BaseModel):
     """Where a plan's green stands in the control step: where the plan has it, or in pieces anywhere, as executions that
     go their own way show it. Under these too `placed` has mostly brought less delay (docs/schedules.md)."""
     cost: Literal["tts", "paper"] = "tts"
+    """The time that all vehicles spend, or the paper's quadratic cost."""
     constraints: Literal["kept", "dropped"] = "kept"
     """Whether greens must fill their cycles and keep their least, and links their storage; what dropping them costs."""
     q: float = Field(0.1, ge=0)
@@ -98,9 +99,11 @@ class Settings(ProblemSettings):
     rho: float | None = Field(None, gt=0)
     """First penalty; by default what suits the cost."""
     relaxation: float = Field(1.6, gt=0, lt=2)
+    """How far an iteration goes beyond what the agents have agreed on."""
     tolerance_abs: float = Field(0.02, gt=0)
     """Absolute tolerance of the residuals [veh]."""
     tolerance_rel: float = Field(1.5e-3, ge=0)
+    """Relative tolerance of the residuals."""
 
     @property
     def first_rho(self) -> float:

@@ -28,7 +28,7 @@ SOONER_S = 1
 class ScheduledSettings(BaseModel):
     """Settings of `scheduled`, found on the nets of tools/tuning_nets.py and `utn17` with seeds 1 to 3."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
     order: Literal["any", "cycle"] = "any"
     """Any stage may come next, or only the one that the net's own cycle has next."""

@@ -39,6 +39,8 @@ from utn_sumo.plant.patience import LONGEST_RED_S, longest_red_s
 from utn_sumo.signals import cycle_phases
 
 PROGRAM = "utn"
+LOG = "sumo.log"
+"""What SUMO complains of, in a run's folder."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,9 @@ class SumoPlant:
         try:
             libsumo.start(["sumo", *arguments])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-            raise PlantError(f"SUMO did not start ({first_line(error)}): see {self.folder / 'sumo.log'}") from error
+            raise PlantError(
+                f"SUMO did not start ({first_line(error)}): mend the scenario, see {self.folder / LOG}"
+            ) from error
         self.sumo_time_s = time.perf_counter() - started
         SumoPlant._owner = self
         self._sumo = libsumo
@@ -217,7 +221,9 @@ class SumoPlant:
             )
             return self._measure()
         except (self._sumo.TraCIException, self._sumo.FatalTraCIError) as error:
-            raise PlantError(f"SUMO broke off at {self.time_s:g} s ({first_line(error)})") from error
+            raise PlantError(
+                f"SUMO broke off at {self.time_s:g} s ({first_line(error)}): mend the scenario, see {self.folder / LOG}"
+            ) from error
 
     def redraw(self, onward: Callable[[int], list[str]], rng: np.random.Generator, speed_share: float) -> None:
         """Give every vehicle on the road a new future: another way, and a slightly other speed.
@@ -283,7 +289,7 @@ class SumoPlant:
         started = time.perf_counter()
         try:
             execution.begin(plan, state)
-        except Exception as error:  # noqa: BLE001 - a foreign execution may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a foreign execution may raise anything
             self._failed(error)
         self.decision_time_s += time.perf_counter() - started
 
@@ -296,12 +302,12 @@ class SumoPlant:
             # Counting takes half the time of any().
             if wish.shape != view.stage.shape or np.count_nonzero(self.network.stage_junction[wish] != self._junctions):
                 raise PlanError(f"{wish.tolist()} is no stage for each junction")  # noqa: TRY301 - one way out
-        except Exception as error:  # noqa: BLE001 - a foreign execution may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a foreign execution may raise anything
             self._failed(error)
             return view.stage
         return wish
 
-    def _failed(self, error: Exception) -> None:
+    def _failed(self, error: BaseException) -> None:
         self.failures.append(f"at {self.time_s:g} s execution: {type(error).__name__}: {error}")
 
     def _show(self, index: int, state: str) -> None:
@@ -411,7 +417,7 @@ def records(folder: Path, seed: int) -> list[str]:
         "--no-step-log",
         "--duration-log.disable",
         "--no-warnings",
-        "--error-log", str(folder / "sumo.log"),
+        "--error-log", str(folder / LOG),
     ]  # fmt: skip
 
 

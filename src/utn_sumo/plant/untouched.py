@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from utn_sumo.errors import PlantError
 from utn_sumo.plant.sumo import SumoPlant, first_line
@@ -37,8 +38,19 @@ class Outcome:
     interrupted: bool
 
 
-def run(arguments: Sequence[str], begin_s: float, end_s: float | None, on_look: Callable[[Look], None]) -> Outcome:
+def version() -> str:
+    """SUMO's own version string."""
+    import libsumo  # noqa: PLC0415 - heavy
+
+    return str(libsumo.getVersion()[1])
+
+
+def run(
+    arguments: Sequence[str], begin_s: float, end_s: float | None, log: Path, on_look: Callable[[Look], None]
+) -> Outcome:
     """Run SUMO from `begin_s` to `end_s`, or until nobody is left, and look at it every `LOOK_S`.
+
+    Among its `arguments` is that its errors go to the file `log`.
 
     Raises PlantError if SUMO does not start or breaks off. A KeyboardInterrupt ends the run early.
     """
@@ -51,7 +63,7 @@ def run(arguments: Sequence[str], begin_s: float, end_s: float | None, on_look: 
     try:
         libsumo.start(["sumo", *arguments])
     except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-        raise PlantError(f"SUMO did not start ({first_line(error)})") from error
+        raise PlantError(f"SUMO did not start ({first_line(error)}): mend the scenario, see {log}") from error
     spent_s = time.perf_counter() - started
     try:
         roads = [edge for edge in libsumo.edge.getIDList() if not edge.startswith(":")]
@@ -67,7 +79,9 @@ def run(arguments: Sequence[str], begin_s: float, end_s: float | None, on_look: 
             present_veh_s += LOOK_S * (on_road + len(libsumo.simulation.getPendingVehicles()))
             on_look(Look(now_s, on_road, sum(halting), present_veh_s / 3600))
     except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-        raise PlantError(f"SUMO broke off at {now_s:g} s ({first_line(error)})") from error
+        raise PlantError(
+            f"SUMO broke off at {now_s:g} s ({first_line(error)}): mend the scenario, see {log}"
+        ) from error
     except KeyboardInterrupt:
         interrupted = True
     finally:
