@@ -39,12 +39,17 @@ UNKNOWN_VEH = 1.0
 """Vehicles that usually come onto a link amid it in a control step, where nobody says how many."""
 
 
+LONGEST_RUN_S = 240 * 3600.0
+"""As long as the longest run that a scenario may ask for: for one whose end nobody knows."""
+
+
 @dataclass(frozen=True)
 class Progress:
     """How far a run is, for whoever watches it."""
 
     time_s: float
     duration_s: float
+    """0, or `LONGEST_RUN_S`, where nobody knows."""
     time_spent_veh_h: float
     queue_veh: float
 
@@ -65,9 +70,9 @@ def run(
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.controller_settings)
     carried_out, execution = controllers.build_execution(scenario, known, controller)
-    step_s, duration_s = net.control_step_s, scenario.duration_s
-    if chosen is not None and chosen.end_s is not None:
-        duration_s = chosen.end_s - chosen.begin_s
+    if execution is not None and chosen is not None:
+        _check_step(chosen, carried_out)
+    step_s, duration_s = net.control_step_s, _duration_s(scenario, chosen)
     steps = int(np.ceil(duration_s / step_s))
     driving = chosen or traffic.drawn(scenario, net)
     folder = recording.new_folder(folder, scenario.name)
@@ -151,6 +156,21 @@ def run(
     }
     recording.write_json(folder / recording.RESULT, result)
     return result
+
+
+def _duration_s(scenario: Scenario, chosen: Case | None) -> float:
+    """How long a run is at the most: of a case without an end until everybody has arrived."""
+    if chosen is None:
+        return scenario.duration_s
+    return LONGEST_RUN_S if chosen.end_s is None else chosen.end_s - chosen.begin_s
+
+
+def _check_step(chosen: Case, execution: str) -> None:
+    if chosen.step_s > 1:
+        raise SettingError(
+            f"scenario {str(chosen.file)!r} has a step-length of {chosen.step_s:g} s: execution {execution!r} switches "
+            "signals to the second, make it 1 s or less"
+        )
 
 
 def _progress(time_s: float, duration_s: float, seen: Look) -> Progress:

@@ -9,6 +9,7 @@ Kc horizons.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -445,8 +446,9 @@ class Network:
         Where that is more than `MOST_CYCLES` times the longest cycle it is the longest cycle: plans are then handed
         over where each junction's cycle begins, wherever in the step that is.
         """
-        multiple, longest_s = float(np.lcm.reduce(self.cycle_s.astype(np.int64))), float(self.cycle_s.max())
-        return self.whole_step_s or (multiple if multiple <= MOST_CYCLES * longest_s else longest_s)
+        # In whole numbers of any size: that of many cycles is beyond 64 bits.
+        multiple, longest_s = math.lcm(*map(int, self.cycle_s)), float(self.cycle_s.max())
+        return self.whole_step_s or (float(multiple) if multiple <= MOST_CYCLES * longest_s else longest_s)
 
     @property
     def samples(self) -> int:
@@ -670,6 +672,11 @@ class View(Protocol):
     @property
     def waiting_veh(self) -> Floats:
         """(G,) standing in the lane-area detectors, by lane group."""
+        ...
+
+    @property
+    def set_waiting_veh(self) -> Floats:
+        """(L,) the same by lane set; who stands before the lanes part is before all that he may go to."""
         ...
 
     @property

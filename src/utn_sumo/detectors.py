@@ -53,6 +53,8 @@ class DetectorIds:
     area: tuple[tuple[str, ...], ...]
     group: tuple[tuple[str, ...], ...]
     """(G,) of the lane-area detectors those on a lane group."""
+    set_area: tuple[tuple[str, ...], ...]
+    """(L,) of the lane-area detectors those on a lane set."""
     group_stop_line: tuple[tuple[str, ...], ...]
     """(G,) of the loops at the stop line those on a lane group."""
     set_stop_line: tuple[tuple[str, ...], ...]
@@ -111,6 +113,7 @@ def ids(network: Network) -> DetectorIds:
             tuple(name for edge, _ in network.watched(link) for name in on("area", edge)) for link in network.links
         ),
         group=tuple(at_line("area", group.link, group.lanes) for group in groups),
+        set_area=tuple(at_line("area", link, lane_set.lanes) for link, lane_set in sets),
         group_stop_line=tuple(at_line("stop", group.link, group.lanes) for group in groups),
         set_stop_line=tuple(at_line("stop", link, lane_set.lanes) for link, lane_set in sets),
         upstream=tuple(

@@ -88,18 +88,17 @@ def gridlocked(network: Network, x_veh: Sequence[Floats], left_veh: Sequence[Flo
 
 
 class Greens:
-    """When turns and lane groups had green, by SUMO's own record of the signals."""
+    """When turns and lane sets had green, by SUMO's own record of the signals."""
 
     def __init__(self, network: Network, switches: Path, duration_s: float, begin_s: float = 0.0):
         """Of a run of `duration_s` that began at SUMO's time `begin_s`. Raises ResultError."""
         shown = monitor.read_switches(switches)
         self._turns = len(network.turns)
-        self._groups = len(network.groups)
         self._spans: dict[int, tuple[Floats, Floats]] = {}
         """Of each turn with signals when its greens began and ended."""
         self._reds: dict[int, tuple[Floats, Floats]] = {}
-        """Of each lane group with signals alone the same of its reds."""
-        unsignalled = set(network.turn_group[network.unsignalled].tolist())
+        """Of each lane set with signals alone the same of its reds."""
+        junction_of_set = network.link_junction[network.set_link]
         for index, junction in enumerate(network.junctions):
             switched = shown.get(junction.id, [])
             times = np.array([second - begin_s for second, _ in switched] + [duration_s], dtype=float)
@@ -110,12 +109,13 @@ class Greens:
             for signal, turns in enumerate(junction.signal_turns):
                 for turn in turns:
                     by_turn.setdefault(turn, []).append(signal)
-            by_group: dict[int, list[int]] = {}
             for turn, signals in by_turn.items():
                 self._spans[turn] = _spans(np.any(letters[:, signals], axis=1), times)
-                by_group.setdefault(int(network.turn_group[turn]), []).extend(signals)
-            for group in set(network.groups_of[index].tolist()) & by_group.keys() - unsignalled:
-                self._reds[group] = _spans(~np.any(letters[:, by_group[group]], axis=1), times)
+            for lane_set in np.flatnonzero(junction_of_set == index).tolist():
+                ways = network.lane_sets[lane_set].letters
+                if all(ways):
+                    signals = sorted({letter for way in ways for letter in way})
+                    self._reds[lane_set] = _spans(~np.any(letters[:, signals], axis=1), times)
 
     def by_turn_s(self, ends_s: Sequence[float]) -> Floats:
         """(steps, M) green of each turn in each control step, of which `ends_s` are the ends; without signals all."""
@@ -127,20 +127,20 @@ class Greens:
         return green_s
 
     def longest_wait_s(self, waiting: Sequence[tuple[float, Bools]]) -> float:
-        """Longest that somebody stood before a lane group's red, on end, without green meanwhile.
+        """Longest that somebody stood before a lane set's red, on end, without green meanwhile.
 
-        `waiting` has (time, whether anybody stands (G,)) at each look: who stood between two looks is not known.
+        `waiting` has (time, whether anybody stands (L,)) at each look: who stood between two looks is not known.
         """
         if not waiting:
             return 0.0
         times = np.array([time_s for time_s, _ in waiting])
         stands = np.array([each for _, each in waiting])
         longest_s = 0.0
-        for group, (begin_s, end_s) in self._reds.items():
-            nobody = np.where(stands[:, group], -1, np.arange(len(times)))
+        for lane_set, (begin_s, end_s) in self._reds.items():
+            nobody = np.where(stands[:, lane_set], -1, np.arange(len(times)))
             since_s = times[np.minimum(np.maximum.accumulate(nobody) + 1, len(times) - 1)]
             # A wait is over at the last look that saw it, or at the red's end if that comes before another look.
-            seen = np.flatnonzero(stands[:, group])
+            seen = np.flatnonzero(stands[:, lane_set])
             red = np.searchsorted(begin_s, times[seen], side="right") - 1
             seen, red = seen[red >= 0], red[red >= 0]
             if not len(seen):

@@ -55,9 +55,7 @@ def watch(
     verdict = Verdict()
     for junction in network.junctions:
         switched = [(second - int(begin_s), state) for second, state in shown.get(junction.id, [])]
-        rules = (
-            _Rules.of(network, junction) if in_order else _Rules.of(network, junction).in_any_order(network, junction)
-        )
+        rules = _Rules.of(network, junction) if in_order else _Rules.in_any_order(network, junction)
         _Guard(network, junction, rules, verdict).judge(_stretches(switched, int(duration_s)))
     return verdict
 
@@ -94,12 +92,15 @@ class _Rules:
     """Least time from the end of one signal's green to the begin of another's."""
 
     @classmethod
-    def of(cls, network: Network, junction: Junction) -> _Rules:
-        """Read off the second and third of three cycles on end: what goes round the cycle is then seen whole."""
+    def of(cls, network: Network, junction: Junction, *, executed: bool = False) -> _Rules:
+        """Read off the second and third of three cycles on end: what goes round the cycle is then seen whole.
+
+        Stages that are `executed` may be shorter than those of a plan.
+        """
         phases: list[tuple[str, float]] = []
         for index in junction.stages:
             stage = network.stages[index]
-            phases += [(stage.state, stage.min_green_s), *stage.clearance]
+            phases += [(stage.state, stage.least_green_s if executed else stage.min_green_s), *stage.clearance]
         cycle_s = sum(seconds for _, seconds in phases)
         size = len(junction.conflicts)
         green, yellow = [math.inf] * size, [math.inf] * size
@@ -125,15 +126,17 @@ class _Rules:
         shown = [[0.0 if math.isinf(least_s) else least_s for least_s in row] for row in (green, yellow, *between)]
         return cls(shown[0], shown[1], shown[2:])
 
-    def in_any_order(self, network: Network, junction: Junction) -> _Rules:
+    @classmethod
+    def in_any_order(cls, network: Network, junction: Junction) -> _Rules:
         """The same for stages in any order: what the programme has beyond one stage, or one clearance, need not be."""
+        own = cls.of(network, junction, executed=True)
         stages = [network.stages[index] for index in junction.stages]
         longest_s = max(stage.clearance_s for stage in stages)
         green = [
             min([least_s, *(stage.least_green_s for stage in stages if stage.state[signal] in GREEN)])
-            for signal, least_s in enumerate(self.green_s)
+            for signal, least_s in enumerate(own.green_s)
         ]
-        return _Rules(green, self.yellow_s, [[min(least_s, longest_s) for least_s in row] for row in self.between_s])
+        return cls(green, own.yellow_s, [[min(least_s, longest_s) for least_s in row] for row in own.between_s])
 
 
 class _Guard:

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from utn_sumo import recording
+from utn_sumo.bridge import LONGEST_RUN_S
 from utn_sumo.bridge import Progress as RunProgress
 from utn_sumo.manual import Entry
 from utn_sumo.scenario import Scenario
@@ -74,8 +75,9 @@ def progress(scenario: Scenario) -> Iterator[Callable[[RunProgress], None]]:
 
     def show(now: RunProgress) -> None:
         bar.start()
+        total = now.duration_s if 0 < now.duration_s < LONGEST_RUN_S else None
         state = f"TTS {now.time_spent_veh_h:.0f} veh h, queue {now.queue_veh:.0f} veh"
-        bar.update(task, completed=now.time_s, total=now.duration_s or None, state=state)
+        bar.update(task, completed=now.time_s, total=total, state=state)
 
     try:
         yield show

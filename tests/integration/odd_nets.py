@@ -282,6 +282,72 @@ def bus_lanes(folder: Path) -> Path:
     return case(folder, bus + traffic("C") + line, halts)
 
 
+def bus_stage(folder: Path, *, cars_every_s: float = 8, end_s: int = 300) -> Path:
+    """A bus lane whose stage is its own, beside cars that have another one."""
+    streets = Streets()
+    for name, x, y, kind in (("C", 0, 0, "traffic_light"), ("W", -300, 0, ""), ("E", 200, 0, ""), ("N", 0, 300, "")):
+        streets.node(name, x, y, kind or "priority")
+    streets.node("S", 0, -ARM_M)
+    for start, end in (("W", "C"), ("C", "E")):
+        streets.one_way(start, end, 2, only={0: "bus"})
+    for start, end in (("N", "C"), ("C", "S")):
+        streets.one_way(start, end)
+    for lane in (0, 1):
+        streets.connection("W-C", "C-E", fromLane=lane, toLane=lane)
+    streets.connection("N-C", "C-S")
+    greens = ((20, "Grr"), (20, "rrG"), (10, "rGr"))
+    shown = [
+        phase for seconds, state in greens for phase in ((seconds, state), (3, state.replace("G", "y")), (2, "rrr"))
+    ]
+    retime(streets.net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
+    cars = (flow(name, *way, period=cars_every_s, end=end_s) for name, way in CROSSING.items())
+    buses = flow("bus", "W-C", "C-E", type="line", period=60, end=end_s, departLane=0)
+    return case(folder, '<vType id="line" vClass="bus"/>' + "".join(cars) + buses, end=str(end_s))
+
+
+CROSSING = {"along": ("W-C", "C-E"), "across": ("N-C", "C-S")}
+
+
+def tram_stage(folder: Path) -> Path:
+    """A crossroads, and a road that trams cross in a stage of their own."""
+    streets = row("A")
+    streets.node("T", ARM_M, 0, "traffic_light")
+    streets.without("A-E", "E-A")
+    streets.road("A", "T")
+    streets.road("T", "E2")
+    streets.node("E2", 2 * ARM_M, 0)
+    for name, y in (("TN", ARM_M), ("TS", -ARM_M)):
+        streets.node(name, ARM_M, y)
+    streets.one_way("TN", "T", allow="tram")
+    streets.one_way("T", "TS", allow="tram")
+    streets.net(folder, NO_TURNAROUNDS)
+    line = flow("tram", "TN-T", "T-TS", type="tram", period=60)
+    cars = flow("in", "E2-T", "A-W") + flow("out", "W-A", "T-E2") + flow("across", "nA-A", "A-sA")
+    return case(folder, '<vType id="tram" vClass="tram"/>' + cars + line)
+
+
+def short_arrow(folder: Path, *, end_s: int = 300) -> Path:
+    """Left turns of one road have an arrow of four seconds, and no other green; nobody comes from the other road."""
+    shown = (
+        *((25, "rrrGGrrrrGGr"), (3, "rrryyrrrryyr"), (2, DARK), (4, "rrrrrGrrrrrG"), (3, "rrrrryrrrrry"), (2, DARK)),
+        *((25, NORTH_SOUTH), (3, "yyyrrryyyrrr"), (2, DARK)),
+    )
+    retime(_pockets().net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
+    ways = (("W", "E", 10), ("E", "W", 10), ("W", "nC", 30))
+    flows = "".join(flow(f"{a}_{b}", f"{a}-p{a}", f"C-{b}", period=period, end=end_s) for a, b, period in ways)
+    return case(folder, flows, end=str(end_s))
+
+
+def ending_amid(folder: Path, *, green_s: float, end_s: int = 300) -> Path:
+    """Half of those who come onto the road between two signals park amid it."""
+    shown = [(green_s if "G" in state else seconds, state) for seconds, state in TWO_STAGES]
+    retime(row("AB", gap_m=150).net(folder, NO_TURNAROUNDS), tl_logic("A", shown), tl_logic("B", shown))
+    ways = (("W-A", "B-E", 20), ("nA-A", "A-sA", 8), ("nB-B", "B-sB", 8))
+    through = "".join(flow(start, start, end, period=period, end=end_s) for start, end, period in ways)
+    parking = flow("in", "W-A", "A-B", period=15, end=end_s, arrivalPos=60)
+    return case(folder, through + parking, options={"time-to-teleport": "-1"}, end=str(end_s))
+
+
 def lorries(folder: Path) -> Path:
     """Half of what drives is 12 to 25 m long and slow to start."""
     row("C").net(folder, NO_TURNAROUNDS)
@@ -801,6 +867,9 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     crossing_amid_a_street,
     bicycle_lanes,
     bus_lanes,
+    bus_stage,
+    tram_stage,
+    short_arrow,
     lorries,
     tram,
     railway,

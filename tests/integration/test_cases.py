@@ -78,6 +78,24 @@ def test_without_an_end_it_runs_until_everybody_has_arrived(town: Path, tmp_path
     assert result["hours"] > 0.25
 
 
+def test_without_an_end_controllers_run_until_everybody_has_arrived_too(tmp_path: Path) -> None:
+    odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    file = odd_nets.case(tmp_path, odd_nets.flow("rare", "W-C", "C-E", period=600, end=15600), end=None)
+    for controller in ("native", "recommended", "fixed"):
+        result = bridge.run(scenario(net=str(file), controller=controller), tmp_path / controller)
+        assert (result["arrived"], result["unfinished"]) == (26, 0)
+        assert result["hours"] > 4
+
+
+def test_steps_too_long_to_switch_signals_to_the_second_are_refused_where_they_have_to_be(tmp_path: Path) -> None:
+    odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    file = odd_nets.case(tmp_path, odd_nets.traffic("C"), options={"step-length": "2"})
+    with pytest.raises(SettingError, match=r"step-length of 2 s: execution 'scheduled' .* make it 1 s or less"):
+        bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / "refused")
+    assert not (tmp_path / "refused").exists()
+    assert bridge.run(scenario(net=str(file), controller="fixed"), tmp_path / "fixed")["unsafe_signal_s"] == 0
+
+
 def test_a_shipped_net_runs_under_its_own_signals_too(tmp_path: Path) -> None:
     native = bridge.run(scenario(controller="native", hours=0.5, demand=0.6, seed=3), tmp_path / "native")
     fixed = bridge.run(scenario(controller="fixed", hours=0.5, demand=0.6, seed=3), tmp_path / "fixed")

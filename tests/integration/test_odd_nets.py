@@ -35,6 +35,7 @@ CONTROLLERS = ("fixed", "dmpc", "cmpc")
 LEFT_ALONE: dict[Make, set[str]] = {
     odd_nets.one_stage: {"M", "F"},
     odd_nets.railway: {"R", "X"},
+    odd_nets.tram_stage: {"T"},
     odd_nets.no_yellow: {"A"},
     odd_nets.switched_off: {"A", "B", "D"},
     odd_nets.blinking_at_night: {"C"},

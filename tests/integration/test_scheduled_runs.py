@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import pytest
 
@@ -178,3 +180,42 @@ def test_who_turns_left_before_others_on_a_lane_is_let_go_though_the_lane_beside
     delay = {controller: sum(each["mean_delay_s"] for each in results) for controller, results in found.items()}
     # Where the whole road counted as one queue it was twice that of SUMO's own signals.
     assert delay["recommended"] < 1.1 * delay["actuated"]
+
+
+def waits_s(folder: Path, prefix: str) -> list[float]:
+    """How long everybody of that name stood all in all; for good who never came."""
+    trips = ET.parse(folder / "trips.xml").getroot().iter("tripinfo")
+    own = [trip.attrib for trip in trips if trip.attrib["id"].startswith(prefix)]
+    return [float(trip["waitingTime"]) if float(trip["departDelay"]) < 60 else math.inf for trip in own]
+
+
+@pytest.mark.parametrize("cars_every_s", [15, 5])
+def test_buses_with_a_stage_of_their_own_are_served_under_schedules(cars_every_s: float, tmp_path: Path) -> None:
+    file = odd_nets.bus_stage(tmp_path, cars_every_s=cars_every_s, end_s=1200)
+    result = bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / "out")
+    assert_safe(result)
+    buses = waits_s(tmp_path / "out", "bus")
+    assert len(buses) >= 15
+    # What is reported is what they wait.
+    assert max(buses) <= result["longest_red_s"] + 30 <= 210
+
+
+def test_who_has_an_arrow_of_four_seconds_only_is_served_under_schedules(tmp_path: Path) -> None:
+    file = odd_nets.short_arrow(tmp_path, end_s=1200)
+    result = bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / "out")
+    assert_safe(result)
+    assert result["teleports"] == 0
+    assert max(waits_s(tmp_path / "out", "")) < 180
+
+
+def test_who_ends_amid_a_road_is_not_taken_to_be_there_until_the_control_step_ends(tmp_path: Path) -> None:
+    delays_s = []
+    for green_s in (25.0, 195.0):
+        folder = tmp_path / f"{green_s:g}"
+        folder.mkdir()
+        file = odd_nets.ending_amid(folder, green_s=green_s, end_s=1800)
+        result = bridge.run(scenario(net=str(file), controller="recommended"), folder / "out")
+        assert_safe(result)
+        delays_s.append(result["mean_delay_s"])
+    # The cycle is nothing to schedules but the time from one estimate to the next.
+    assert delays_s[1] < 1.3 * delays_s[0]

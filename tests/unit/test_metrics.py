@@ -43,7 +43,7 @@ def test_green_by_turn_is_what_was_shown(utn17: Network, shown: Path) -> None:
 
 def test_who_stands_all_the_time_waits_for_the_longest_red(utn17: Network, shown: Path) -> None:
     looks = [10.0 * look for look in range(1, 361)]
-    everybody = np.ones(len(utn17.groups), dtype=bool)
+    everybody = np.ones(len(utn17.lane_sets), dtype=bool)
     assert greens(utn17, shown).longest_wait_s([(look, everybody) for look in looks]) == 75
     assert greens(utn17, shown).longest_wait_s([(look, ~everybody) for look in looks]) == 0
     assert greens(utn17, shown).longest_wait_s([]) == 0
@@ -53,10 +53,7 @@ def test_a_wait_begins_when_it_is_first_seen_and_ends_when_it_is_last_seen(utn17
     group = utn17.turns[utn17.stages[utn17.junctions[0].stages[0]].turns[0]].group
     # Its red is from 30 to 105 s.
     for first_s, last_s, wait_s in ((50, 80, 30), (60, 100, 45), (60, 200, 65), (10, 60, 30), (10, 20, 0)):
-        looks = [
-            (10.0 * look, (np.arange(len(utn17.groups)) == group) & (first_s <= 10 * look <= last_s))
-            for look in range(1, 30)
-        ]
+        looks = [(10.0 * look, (utn17.set_group == group) & (first_s <= 10 * look <= last_s)) for look in range(1, 30)]
         assert greens(utn17, shown).longest_wait_s(looks) == wait_s
 
 

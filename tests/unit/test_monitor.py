@@ -188,3 +188,27 @@ def test_an_unreadable_record_is_refused_in_one_line(utn17: Network, tmp_path: P
     path.unlink()
     with pytest.raises(ResultError, match="can't be read"):
         monitor.watch(utn17, path, 10)
+
+
+def test_in_any_order_a_stage_between_two_others_need_last_for_its_least_green_only(
+    utn17: Network, record: Path
+) -> None:
+    # The clearance after the last stage is far longer than those about the short one amid it.
+    stages = list(utn17.stages)
+    _, second, third = utn17.junctions[0].stages
+    long = (*stages[third].clearance[:-1], ("r" * 10, 14.0))
+    stages[third] = replace(stages[third], clearance=long)
+    net = replace(utn17, stages=tuple(stages))
+    least_s = stages[second].least_green_s
+    assert least_s < stages[second].min_green_s
+    shown = [(FIRST, 30), (YELLOW, 3), (RED, 2), (SECOND, least_s), ("rrryyyyrrr", 3), (RED, 2), (THIRD, 300)]
+    starts = [0.0, *accumulate(seconds for _, seconds in shown)]
+    lines = [
+        f'<tlsState time="{start:g}" id="J1" state="{state}"/>'
+        for start, (state, _) in zip(starts, shown, strict=False)
+    ]
+    record.write_text(f"<tlsStates>{''.join(lines)}</tlsStates>", encoding="utf-8")
+    found = monitor.watch(net, record, 60, in_order=False)
+    assert [reason for reason in found.reasons if reason.startswith("J1")] == []
+    in_order = monitor.watch(net, record, 60)
+    assert any("least" in reason for reason in in_order.reasons if reason.startswith("J1"))

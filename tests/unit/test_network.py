@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import shutil
 from itertools import combinations, pairwise
@@ -228,10 +229,18 @@ def test_a_cut_off_net_is_refused_in_one_line(town: Path, share: float) -> None:
     assert str(town) in one_line_of(str(town))
 
 
-def test_a_net_without_traffic_lights_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_net_without_traffic_lights_or_roads_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "dark.net.xml"
-    path.write_text('<net version="1.20"></net>', encoding="utf-8")
-    assert "no traffic lights" in one_line_of(str(path))
+    ends = "".join(f'<junction id="{end}" type="dead_end" x="0" y="{end}" incLanes="" intLanes=""/>' for end in "01")
+    lane = '<lane id="road_0" index="0" speed="13" length="9" shape="0,0 0,1"/>'
+    road = f'<edge id="road" from="0" to="1" priority="1">{lane}</edge>'
+    for content, complaint in (
+        ("", "holds no roads"),
+        (road + ends, "no traffic lights"),
+        ((road + ends).replace('speed="13"', 'speed="0"'), "lane 'road_0' has a speed of 0"),
+    ):
+        path.write_text(f'<net version="1.20">{content}</net>', encoding="utf-8")
+        assert complaint in one_line_of(str(path))
 
 
 def edited(town: Path, *changes: tuple[str, str]) -> Path:
@@ -335,3 +344,9 @@ def test_a_bad_turns_file_beside_a_net_is_refused_in_one_line(town: Path, relati
     content = f"<data><interval>{relations}</interval></data>"
     town.with_name("town.turns.xml").write_text(content, encoding="utf-8")
     assert "turning fractions" in one_line_of(str(town))
+
+
+def test_many_cycles_without_a_common_one_are_planned_for_in_steps_of_the_longest(utn17: Network) -> None:
+    # Their least common multiple is below 0 in 64 bits.
+    junctions = tuple(dataclasses.replace(utn17.junctions[0], cycle_s=float(cycle_s)) for cycle_s in range(75, 99, 2))
+    assert dataclasses.replace(utn17, junctions=junctions).control_step_s == 97

@@ -223,3 +223,17 @@ def test_it_goes_by_the_turning_fractions_that_it_is_told(utn17: Network) -> Non
     (stream,) = np.flatnonzero(come.sum(axis=1))
     turn = utn17.turns[first[0]]
     assert (road.streams.group[stream], road.streams.next_link[stream]) == (turn.group, turn.next_link)
+
+
+@pytest.mark.parametrize("length_m", [2.0, 8.0, 13.0])
+def test_whom_a_neighbour_sends_onto_a_road_of_a_moment_comes_and_nobody_else(utn17: Network, length_m: float) -> None:
+    short = tuple(replace(link, length_m=length_m) for link in utn17.links)
+    outlook = Outlook(replace(utn17, links=short), streams := Streams(utn17), BINS, BIN_S)
+    stream = int(np.flatnonzero(streams.next_link != EXIT)[0])
+    # Those behind it in memory are sent off by others, to other roads.
+    outlook.sent_veh[:] = np.where(streams.next_link != streams.next_link[stream], 1000.0, 0.0)[:, None]
+    outlook.sent_veh[stream] = 1.0
+    _, come = looked(outlook, scene(utn17))
+    arrive = come[streams.link == streams.next_link[stream]].sum(axis=0)
+    assert arrive == pytest.approx([*np.ones(BINS - 1), arrive[-1]])
+    assert 0 <= arrive[-1] <= 1

@@ -94,7 +94,7 @@ def test_phases_alike_in_a_row_are_one() -> None:
 def test_a_programme_that_shows_one_thing_only_has_one_stage() -> None:
     found = programme((30, "GG"), (60, "GG"))
     assert [(block.stage.duration_s, block.clearance) for block in found.blocks] == [(90, ())]
-    assert "one stage" in programmes.why_left_alone(found, 2)
+    assert "one stage" in programmes.why_left_alone(found, 2, (), ())
 
 
 @pytest.mark.parametrize(
@@ -147,14 +147,35 @@ def test_every_stage_is_plain_green_that_somebody_can_use(shown: list[tuple[int,
     found = programme(*shown)
     if not found.opens:
         return
+    longer = [block.stage.green for block in found.blocks if block.stage.duration_s >= SHORTEST_STAGE_S]
     for block in found.blocks:
         assert block.stage.is_plain_green
-        assert block.stage.duration_s >= SHORTEST_STAGE_S
+        # A shorter one has somebody for himself.
+        assert block.stage.duration_s >= SHORTEST_STAGE_S or block.stage.green.difference(*longer)
         assert 1 <= block.min_green_s(MIN_GREEN_S) <= math.ceil(block.stage.duration_s)
         assert block.min_green_s(MIN_GREEN_S) == round(block.min_green_s(MIN_GREEN_S))
     # Nobody who turns green, or gets protection, for five seconds or more and beside no yellow is left in a clearance.
     cleared = [phase for block in found.blocks for phase in block.clearance]
     assert not [phase for phase in cleared if phase.is_plain_green and phase.duration_s >= MIN_GREEN_S]
+    # Nor is anybody in no stage at all who has green without yellow beside it.
+    served = frozenset().union(*(block.stage.green for block in found.blocks))
+    assert all(phase.green <= served for phase in found.phases if phase.is_plain_green)
+
+
+def test_who_has_green_for_four_seconds_only_has_a_stage_and_who_keeps_his_for_four_has_none() -> None:
+    found = programme((30, "Gr"), (4, "yr"), (4, "rG"), (4, "ry"))
+    assert [block.stage.state for block in found.blocks] == ["Gr", "rG"]
+    assert found.blocks[1].min_green_s(MIN_GREEN_S) == 4
+    kept = programme((30, "GGr"), (4, "Gyr"), (4, "Grr"), (4, "yrr"), (20, "rrG"), (4, "rry"))
+    assert [block.stage.state for block in kept.blocks] == ["GGr", "rrG"]
+
+
+def test_a_signal_is_left_alone_whom_a_stage_would_forget() -> None:
+    found = programme((30, "Grr"), (4, "yGr"), (20, "rrG"), (4, "rry"))
+    assert "signal 1 has green amid clearances only" in programmes.why_left_alone(found, 3, range(3), ())
+    # Whoever uses no motor.
+    assert programmes.why_left_alone(found, 3, (0, 2), (1,)) == ""
+    assert "trams or bicycles alone" in programmes.why_left_alone(found, 3, (0, 1), (2,))
 
 
 @given(shown=SHOWN, turn=st.integers(0, 8), offset_s=st.integers(-50, 50))
@@ -210,7 +231,7 @@ def test_a_programme_of_an_additional_file_whose_phases_name_their_successors_is
         'duration="3" state="ry"',
     )
     found = programmes.added([written(tmp_path, logic("C", *phases))])["C"]
-    assert "next" in programmes.why_left_alone(found, 2)
+    assert "next" in programmes.why_left_alone(found, 2, (), ())
 
 
 def test_what_an_additional_file_includes_stands_where_it_is_included(tmp_path: Path) -> None:
@@ -256,6 +277,6 @@ def test_signals_that_sumo_switches_itself_are_named_until_a_later_programme_sta
     ids=["none", "off", "no green", "one stage", "few letters", "uneven", "good"],
 )
 def test_why_a_signal_is_left_alone_is_said(found: Programme | None, signals: int, reason: str) -> None:
-    why = programmes.why_left_alone(found, signals)
+    why = programmes.why_left_alone(found, signals, range(signals), ())
     assert reason in why
     assert bool(why) == bool(reason)

@@ -18,6 +18,7 @@ class Scene:
     begin_s: Floats
     free: Bools
     waiting_veh: Floats
+    set_waiting_veh: Floats
     near_veh: Floats
     set_zone_veh: Floats
     link_zone_veh: Floats
@@ -66,6 +67,7 @@ def scene(
         np.zeros(len(network.junctions)),
         np.ones(len(network.junctions), dtype=bool),
         everybody,
+        sets + veh,
         everybody,
         by_the_line(sets + veh),
         np.zeros((len(network.links), len(ZONES_M))),

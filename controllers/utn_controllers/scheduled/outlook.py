@@ -226,7 +226,7 @@ def _send(
                 continue
             # A bin of what it has planned has gone by; who left in it is mostly amid the junction, not yet counted.
             delay = int(due_s[link] / bin_s + 0.5) - 1
-            for place in range(max(delay, 0), bins):
+            for place in range(max(delay, 0), min(bins, bins + delay)):
                 coming[link, place] += sent[stream, place - delay]
     for link in range(links):
         if not asked[link]:

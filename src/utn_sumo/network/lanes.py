@@ -53,6 +53,6 @@ def lane_sets(ways: Mapping[int, Ways], states: Iterable[str]) -> list[tuple[tup
 
 
 def _some_stand(lanes: Iterable[Ways], state: str) -> bool:
-    """Whether who is first in a lane may have red while all of another lane have green."""
+    """Whether who is first in a lane may have red, or has, while all of another lane have green."""
     greens = [{state[letter] in GREEN for letters in own.values() for letter in letters} for own in lanes]
-    return {True} in greens and {True, False} in greens
+    return {True} in greens and any(False in each for each in greens)

@@ -3,7 +3,7 @@
 A stage is a phase that shows green and no yellow. What follows it up to the next stage is its clearance, taken from the
 net and never optimised: yellow, all-red, red and yellow, and short remnants of the green before, such as the seconds
 in which the pedestrians of a crossing have red already and the cars beside them still have green. A phase under five
-seconds is never a stage: nobody could use it.
+seconds is a stage only if nobody else lets go whom it does.
 """
 
 from __future__ import annotations
@@ -98,11 +98,18 @@ class Programme:
     def opens(self) -> list[int]:
         """Which phases are stages."""
         around = [self.phases[-1:], *([phase] for phase in self.phases[:-1])] if self.phases else []
-        return [
+        stages = [
             index
             for index, (phase, (before,)) in enumerate(zip(self.phases, around, strict=True))
             if phase.is_plain_green and not _is_remnant(phase, before)
         ]
+        # However short it is, whom no other one lets go has this one.
+        opened = {signal for index in stages for signal in self.phases[index].green}
+        for index, phase in enumerate(self.phases):
+            if phase.is_plain_green and not phase.green <= opened:
+                stages.append(index)
+                opened |= phase.green
+        return sorted(stages)
 
     @property
     def begin_s(self) -> float:
@@ -199,8 +206,11 @@ def _phase(element: Any) -> Phase:
     return Phase(element.get("state", ""), duration_s, None if least is None else float(least), elsewhere)
 
 
-def why_left_alone(programme: Programme | None, signals: int) -> str:
-    """Why a signal with so many letters in use can't be controlled; empty if it can."""
+def why_left_alone(programme: Programme | None, signals: int, motor: Collection[int], beside: Collection[int]) -> str:
+    """Why a signal with so many letters in use can't be controlled; empty if it can.
+
+    Of these letters some are of `motor` traffic, some of trams and bicycles `beside` it.
+    """
     if programme is None:
         return "it has no signal programme, as rail signals have none"
     states = [phase.state for phase in programme.phases]
@@ -212,5 +222,15 @@ def why_left_alone(programme: Programme | None, signals: int) -> str:
     if stages < 2:  # noqa: PLR2004 - what can be shared out
         few = "one stage: there is nothing to share out", "no phase that shows green without yellow"
         return f"its programme has {few[stages == 0]}"
-    uneven = any(len(state) != len(states[0]) or len(state) < signals for state in states)
-    return f"its programme's states have not a letter for each of its {signals} signals" if uneven else ""
+    if any(len(state) != len(states[0]) or len(state) < signals for state in states):
+        return f"its programme's states have not a letter for each of its {signals} signals"
+    return _whom_no_stage_serves(programme, motor, beside)
+
+
+def _whom_no_stage_serves(programme: Programme, motor: Collection[int], beside: Collection[int]) -> str:
+    stages = [programme.phases[index].green for index in programme.opens]
+    if any(not green.isdisjoint(beside) and green.isdisjoint(motor) for green in stages):
+        return "it has a stage for trams or bicycles alone, whom no detector sees"
+    ever = frozenset[int]().union(*(phase.green for phase in programme.phases))
+    amid = ever.intersection(motor).difference(*stages)
+    return f"signal {min(amid)} has green amid clearances only" if amid else ""

@@ -113,7 +113,7 @@ def read(
 def _why_left_alone(signal: Signal) -> str:
     if not signal.approaches:
         return "no motor traffic passes it"
-    return programmes.why_left_alone(signal.programme, signal.used_letters)
+    return programmes.why_left_alone(signal.programme, signal.used_letters, signal.of_motors, signal.beside_motors)
 
 
 def _sharing_approaches(signals: Sequence[Signal]) -> dict[str, str]:

@@ -25,6 +25,9 @@ class Signal:
         for from_lane, to_lane, index in tls.getConnections():
             self.connections += [(each, index) for each in from_lane.getOutgoing() if each.getToLane() is to_lane]
         self.of_vehicles = frozenset(index for _, index in self.connections)
+        self.of_motors = frozenset(index for connection, index in self.connections if for_motors([connection]))
+        self.beside_motors = self.of_vehicles - self.of_motors
+        """Letters of trams and bicycles alone."""
         self._walked = crossings
         self._net = net
         used = [*self.of_vehicles, *(index for crossing in crossings for index in crossing.letters)]

@@ -15,6 +15,9 @@ from utn_sumo.contract import CLOSE_ZONES, EXIT, ZONES_M, Bools, Floats, Ints, N
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.heads import Heads
 
+COMPARED_S = 10.0
+"""Time between two looks at whether as many can be on a link as are counted."""
+
 
 class Eyes:
     """Reads the lane-area detectors and the loops of a network."""
@@ -28,12 +31,12 @@ class Eyes:
         self._share = network.group_shares(network.fraction)
         """(G,) of a link's traffic what takes the lanes of each group."""
         self._set_link = network.set_link
-        # Detectors of a lane group or set, then of a link before its lanes part.
-        by_group = np.concatenate([network.link_junction[network.group_link], network.link_junction])
+        self._set_group = network.set_group
+        # Detectors of a lane set, then of a link before its lanes part.
         by_set = np.concatenate([network.link_junction[network.set_link], network.link_junction])
         self._is_shared = any(ids.upstream)
         detectors = partial(_Detectors, junctions=len(network.junctions))
-        self._areas = detectors([*ids.group, *ids.upstream], by_group)
+        self._areas = detectors([*ids.set_area, *ids.upstream], by_set)
         self._zones = detectors(
             list(chain.from_iterable([*ids.set_zone, *ids.upstream_zone])), np.repeat(by_set, len(ZONES_M))
         )
@@ -63,6 +66,12 @@ class Eyes:
         self._since_s = bare(sumo, "inductionloop", "getTimeSinceDetection")
         self._x_veh = np.zeros(self._links)
         """(Z,) vehicles on each link when the control step began."""
+        self._unseen_veh = network.storage_veh - network.watched_veh
+        """(Z,) vehicles that fit on what the lane-area detectors do not see of each link."""
+        self._lanes = np.array([link.lanes for link in network.links], dtype=np.float64)
+        """(Z,) one a lane may be seen who is not counted yet, or no more."""
+        self._compared_s = -np.inf
+        """When what is counted was last held against what is seen."""
         self._entered_veh = np.zeros(self._links)
         self._left_veh = np.zeros(self._sets)
         """(Z,) vehicles that had come onto each link by then, (L,) that had crossed each lane set's stop line."""
@@ -80,13 +89,27 @@ class Eyes:
         """Wall time so far inside SUMO's functions, in readings of many detectors at once."""
         return self._areas.sumo_time_s + self._zones.sumo_time_s + self._entries.sumo_time_s + self._exits.sumo_time_s
 
-    def waiting_veh(self) -> Floats:
-        """(G,) standing in the lane-area detectors."""
-        return self._by_group(self._areas.read(self._halting))
+    def standing_veh(self) -> Floats:
+        """(L + Z,) standing in the lane-area detectors of lane sets, and of links before their lanes part."""
+        return self._areas.read(self._halting)
 
     def near_veh(self) -> Floats:
         """(G,) in the lane-area detectors, moving or not."""
-        return self._by_group(self._areas.read(self._present))
+        return self.by_group(self._areas.read(self._present))
+
+    def by_group(self, veh: Floats) -> Floats:
+        """(G,) counts by lane group, of (L + Z,) with those before the lanes part, shared out as traffic is."""
+        own: Floats = np.bincount(self._set_group, veh[: self._sets], self._groups).astype(np.float64)
+        if not self._is_shared:
+            return own
+        return np.asarray(own + veh[self._sets :][self._group_link] * self._share)
+
+    def by_set(self, veh: Floats) -> Floats:
+        """(L,) the same by lane set; of those before the lanes part each has what its lane group has."""
+        own = veh[: self._sets]
+        if not self._is_shared:
+            return own
+        return np.asarray(own + veh[self._sets :][self._set_link] * self._share[self._set_group])
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
         """(L, zones) and (Z, zones) of contract.View."""
@@ -104,7 +127,18 @@ class Eyes:
         counted: tuple[Floats, Floats, Floats] = _counted(
             came, left, self._x_veh, self._entered_veh, self._left_veh, self._set_link
         )
+        if time_s >= self._compared_s + COMPARED_S:
+            self._compare(counted[0])
+            self._compared_s = time_s
         return counted
+
+    def _compare(self, x_veh: Floats) -> None:
+        """Bring what is known of who is on each link (Z,) to what can be: some start or end amid it, uncounted."""
+        veh = self._areas.read(self._present)
+        seen_veh = np.bincount(self._set_link, veh[: self._sets], self._links) + veh[self._sets :]
+        can_be = np.clip(x_veh, seen_veh - self._lanes, seen_veh + self._unseen_veh + self._lanes)
+        self._x_veh += can_be - x_veh
+        x_veh[:] = np.maximum(can_be, 0.0)
 
     def close_one_veh(self, lane_set: int) -> float:
         """In the zones up to CLOSE_ZONES of one lane set, and before its lanes part, moving or not."""
@@ -140,13 +174,6 @@ class Eyes:
         self._entries.read(lambda _: 0)
         left = np.zeros(self._sets + self._links)
         _counted(self._x_veh, left, self._x_veh, self._entered_veh, self._left_veh, self._set_link)
-
-    def _by_group(self, veh: Floats) -> Floats:
-        """(G,) counts by lane group, of (G + Z,) with those before the lanes part, shared out as traffic is."""
-        own = veh[: self._groups]
-        if not self._is_shared:
-            return own
-        return np.asarray(own + veh[self._groups :][self._group_link] * self._share)
 
 
 class _Detectors:
@@ -219,10 +246,19 @@ class Sight:
         self.zone_veh = eyes.zone_veh
         self._eyes = eyes
 
-    @cached_property
+    @property
     def waiting_veh(self) -> Floats:
         """(G,) standing in the lane-area detectors, by lane group."""
-        return self._eyes.waiting_veh()
+        return self._eyes.by_group(self._standing_veh)
+
+    @property
+    def set_waiting_veh(self) -> Floats:
+        """(L,) the same by lane set."""
+        return self._eyes.by_set(self._standing_veh)
+
+    @cached_property
+    def _standing_veh(self) -> Floats:
+        return self._eyes.standing_veh()
 
     @cached_property
     def near_veh(self) -> Floats:

@@ -36,28 +36,31 @@ def longest_red_s(teleport_s: float) -> float:
 
 
 class Patience:
-    """Keeps since when somebody has been waiting for each turn, and for each crossing of those who walk."""
+    """Keeps since when somebody has been waiting on each way (W), a turn from a lane set, and where people walk."""
 
     def __init__(self, network: Network, held_s: Floats, longest_red_s: float = LONGEST_RED_S):
         """Stages of each junction may begin `held_s` (J,) later than the clearance before is over."""
         self._longest_red_s = longest_red_s
-        self._turn_group = network.turn_group
-        self._needs = np.hstack([network.serves, _walks(network)])
-        """(S, M + walks) which turns and which letters of pedestrians each stage has green for."""
+        self._way_set, ways = _ways(network)
+        """(W,) lane set of each way."""
+        self._needs = np.hstack([ways, _walks(network)])
+        """(S, W + walks) which ways and which letters of pedestrians each stage has green for."""
         self._served = self._needs.any(axis=0)
         self._junction = network.stage_junction[self._needs.argmax(axis=0)]
-        """(M + walks,) whose stages these are."""
-        self._leaves_s = network.clearance_s + held_s[network.stage_junction]
-        """(S,) from a stage's end until another one begins."""
+        """(W + walks,) whose stages these are."""
+        longest_s = np.zeros(len(network.junctions))
+        np.maximum.at(longest_s, network.stage_junction, network.clearance_s)
+        self._leaves_s = (longest_s + held_s)[network.stage_junction]
+        """(S,) from a stage's end until another one begins, whichever that is."""
         self._lasts_s = network.least_green_s + self._leaves_s
         """(S,) from a stage's begin until another one can begin."""
         all_s = np.bincount(network.stage_junction, self._lasts_s)
         self._carefree_s = np.clip(longest_red_s - LOOK_S - all_s, 0.0, PATIENCE * longest_red_s)
         """(J,) before somebody has waited so long all can be served, whoever they are and whatever is wished."""
         self._since_s = np.zeros(self._needs.shape[1])
-        """(M + walks,) since when somebody has been waiting for each, without green meanwhile."""
+        """(W + walks,) since when somebody has been waiting for each, without green meanwhile."""
         self._stood_s = np.full(self._needs.shape[1], -np.inf)
-        """(M + walks,) when somebody was last seen standing before each."""
+        """(W + walks,) when somebody was last seen standing before each."""
         self._look_s = 0.0
         """When it is looked again who waits."""
         self._next: dict[int, tuple[int, float]] = {}
@@ -80,7 +83,7 @@ class Patience:
 
     def _look(self, view: View) -> None:
         waits, troubled = _look(
-            view.time_s, view.stage, view.waiting_veh, self._turn_group, self._needs, self._served, self._junction,
+            view.time_s, view.stage, view.set_waiting_veh, self._way_set, self._needs, self._served, self._junction,
             self._carefree_s, self._stood_s, self._since_s,
         )  # fmt: skip
         self._next = {
@@ -94,7 +97,7 @@ class Patience:
         """Have the machine code made now, not at the first look."""
         stage = np.array([junction.stages[0] for junction in network.junctions], dtype=np.int64)
         _look(
-            0.0, stage, np.zeros(len(network.groups)), self._turn_group, self._needs, self._served, self._junction,
+            0.0, stage, np.zeros(len(network.lane_sets)), self._way_set, self._needs, self._served, self._junction,
             self._carefree_s, self._stood_s.copy(), self._since_s.copy(),
         )  # fmt: skip
 
@@ -115,14 +118,14 @@ class Patience:
 
 @compiled
 def _look(
-    time_s: float, stage: Ints, waiting: Floats, turn_group: Ints, needs: Bools, served: Bools, junction: Ints,
+    time_s: float, stage: Ints, waiting: Floats, way_set: Ints, needs: Bools, served: Bools, junction: Ints,
     carefree_s: Floats, stood_s: Floats, since_s: Floats,
 ) -> tuple[Bools, Bools]:  # fmt: skip
-    """(M + walks,) who waits without green, (J,) where somebody's time may come; keeps `stood_s` and `since_s`."""
+    """(W + walks,) who waits without green, (J,) where somebody's time may come; keeps `stood_s` and `since_s`."""
     waits, troubled = np.zeros(len(since_s), np.bool_), np.zeros(len(carefree_s), np.bool_)
     for each in range(len(since_s)):
-        # Pedestrians, whom no detector sees, may always be waiting.
-        if each >= len(turn_group) or waiting[turn_group[each]] > 0:
+        # Pedestrians, trams, bicycles, whom no detector sees, may always be waiting.
+        if each >= len(way_set) or waiting[way_set[each]] > 0:
             stood_s[each] = time_s
         is_red = served[each] and not needs[stage[junction[each]], each]
         waits[each] = time_s - stood_s[each] <= PAUSE_S and is_red
@@ -133,9 +136,30 @@ def _look(
     return waits, troubled
 
 
+def _ways(network: Network) -> tuple[Ints, Bools]:
+    """(W,) lane set of each way from one to a turn, (S, W) whether a stage has green for it."""
+    ways = sorted(
+        (turn, lane_set, letters)
+        for lane_set, each in enumerate(network.lane_sets)
+        for turn, letters in zip(each.turns, each.letters, strict=True)
+    )
+    way_set = np.array([lane_set for _, lane_set, _ in ways], dtype=np.int64)
+    way_junction = network.link_junction[network.set_link[way_set]]
+    green = np.zeros((len(network.stages), len(ways)), dtype=np.bool_)
+    for index, stage in enumerate(network.stages):
+        for way in np.flatnonzero(way_junction == stage.junction):
+            green[index, way] = any(stage.state[letter] in clearances.GREEN for letter in ways[way][2])
+    return way_set, green
+
+
 def _walks(network: Network) -> Bools:
-    """(S, walks) which letters that are no vehicles' each stage has green for."""
-    walks = [(index, letter) for index, junction in enumerate(network.junctions) for letter in junction.without_yellow]
+    """(S, walks) which letters that are not of motor traffic each stage has green for: who walks, trams, bicycles."""
+    walks = [
+        (index, letter)
+        for index, junction in enumerate(network.junctions)
+        for letter, turns in enumerate(junction.signal_turns)
+        if not turns
+    ]
     green = [
         [stage.junction == index and stage.state[letter] in clearances.GREEN for index, letter in walks]
         for stage in network.stages

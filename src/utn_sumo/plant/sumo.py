@@ -100,7 +100,7 @@ class SumoPlant:
         """Of that, inside SUMO's functions: those that read detectors, found by name, and those that show signals."""
         self.truth: Truth | None = None
         self.waiting: list[tuple[float, Bools]] = []
-        """(time, whether somebody stands before the stop line (G,)) at each sample, for the record."""
+        """(time, whether somebody stands before the stop line (L,)) at each sample, for the record."""
         self.failures: list[str] = []
         """What an execution did wrong, whose junctions then kept their stages."""
         self._ids = detectors.ids(network)
@@ -211,7 +211,7 @@ class SumoPlant:
                 np.maximum(peak_x, x_veh, out=peak_x)
                 spent_veh_s += self._present() * (self.time_s - sampled_s)
                 sampled_s = self.time_s
-                self.waiting.append((self.time_s, self._eyes.waiting_veh() > 0))
+                self.waiting.append((self.time_s, self._eyes.by_set(self._eyes.standing_veh()) > 0))
                 queue_veh = self._by_link("getLastStepHaltingNumber")
                 np.maximum(peak_queue, queue_veh, out=peak_queue)
             pending = self._sumo.edge.getPendingVehicles
