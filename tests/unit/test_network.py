@@ -350,3 +350,9 @@ def test_many_cycles_without_a_common_one_are_planned_for_in_steps_of_the_longes
     # Their least common multiple is below 0 in 64 bits.
     junctions = tuple(dataclasses.replace(utn17.junctions[0], cycle_s=float(cycle_s)) for cycle_s in range(75, 99, 2))
     assert dataclasses.replace(utn17, junctions=junctions).control_step_s == 97
+
+
+def test_a_net_that_does_not_say_who_gives_way_to_whom_is_refused_in_one_line(town: Path) -> None:
+    lines = town.read_text(encoding="utf-8").splitlines(keepends=True)
+    town.write_text("".join(line for line in lines if "<request" not in line), encoding="utf-8")
+    assert "no right of way of stream" in one_line_of(str(town))

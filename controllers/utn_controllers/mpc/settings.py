@@ -23,7 +23,7 @@ class ProblemSettings(BaseModel):
     """Step of the prediction's model; a divisor of the control step, by default all of it."""
     greens: Literal["placed", "anywhere"] = "placed"
     """Where a plan's green stands in the control step: where the plan has it, or in pieces anywhere, as executions that
-    go their own way show it. Under these too `placed` has mostly brought less delay (docs/schedules.md)."""
+    go their own way show it. Under these too `placed` has mostly brought less delay (docs/experiments.md)."""
     cost: Literal["tts", "paper"] = "tts"
     """The time that all vehicles spend, or the paper's quadratic cost."""
     constraints: Literal["kept", "dropped"] = "kept"

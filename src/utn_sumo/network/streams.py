@@ -9,6 +9,7 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+from utn_sumo.errors import NetworkError
 from utn_sumo.network.programmes import Programme
 from utn_sumo.network.roads import STRAIGHT, for_motors
 from utn_sumo.xml_files import opened
@@ -55,14 +56,14 @@ class Signal:
             foes = [
                 (b, other.getFrom() is connection.getFrom() and other.getToLane() is connection.getToLane())
                 for node_b, request_b, b, other in streams
-                if node_b is node and node.areFoes(request, request_b)
+                if node_b is node and _are_foes(node, request, request_b)
             ]
             turns, leaves = connection.getDirection() != STRAIGHT, connection.getFrom().getID()
             foes += [
                 (b, turns and leaves not in crossing.edges)
                 for crossing in self._walked
                 for b in crossing.letters
-                if crossing.node == node.getID() and node.areFoes(request, crossing.request)
+                if crossing.node == node.getID() and _are_foes(node, request, crossing.request)
             ]
             for b, at_peace in foes:
                 if a != b and not at_peace:
@@ -93,9 +94,20 @@ class Signal:
             for other, other_letter in self.connections
             if (letter, other_letter) == (a, b)
             and (node := connection.getFrom().getToNode()) is other.getFrom().getToNode()
-            and node.areFoes(node.getLinkIndex(connection), node.getLinkIndex(other))
+            and _are_foes(node, node.getLinkIndex(connection), node.getLinkIndex(other))
         ]
         return bool(before) and all(before)
+
+
+def _are_foes(node: Any, one: int, other: int) -> bool:
+    """Whether two of a node's streams conflict. Raises NetworkError if the net does not say."""
+    try:
+        return bool(node.areFoes(one, other))
+    except (KeyError, IndexError) as error:
+        raise NetworkError(
+            f"the net has no right of way of stream {one} at junction {node.getID()!r} (<request>): give a .net.xml "
+            "written by netconvert"
+        ) from error
 
 
 @dataclass(frozen=True)
