@@ -85,6 +85,8 @@ class LaneSet:
     turns: tuple[int, ...]
     letters: tuple[tuple[int, ...], ...]
     """The letters of its junction by which each turn goes from these lanes: none where no signal stops it."""
+    is_reserved: bool = False
+    """Whether they are closed to cars, as lanes for buses."""
 
 
 @dataclass(frozen=True)
@@ -184,6 +186,8 @@ class Network:
     """Time from the start of green until the queue moves over the stop line; the yellow gives it back at its end."""
     whole_step_s: float | None = None
     """Of a part: the control step of the network that it is a part of, which its own cycles need not tell."""
+    shortest_m: float = 5.0
+    """Length of the shortest vehicle that will drive; a car's where nobody says."""
     left_alone: Mapping[str, str] = field(default_factory=dict)
     """Signals that are none of the junctions, and why: they keep the net's own programme."""
 

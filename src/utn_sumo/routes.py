@@ -95,7 +95,8 @@ class _Way(NamedTuple):
 
 class _Kind(NamedTuple):
     vclass: str
-    space_m: float
+    length_m: float
+    gap_m: float
 
 
 T = TypeVar("T")
@@ -113,7 +114,7 @@ class _Reader:
         self.path = case.file
         self.ways: dict[str, Shares[_Way]] = {}
         self.kinds: dict[str, Shares[_Kind]] = {
-            name: [(_Kind(vclass, sum(LENGTH_AND_GAP_M.get(vclass, CAR_M))), 1.0)] for name, vclass in BUILT_IN.items()
+            name: [(_Kind(vclass, *LENGTH_AND_GAP_M.get(vclass, CAR_M)), 1.0)] for name, vclass in BUILT_IN.items()
         }
         self.turned_veh: defaultdict[tuple[str, str], float] = defaultdict(float)
         self.trips_veh: defaultdict[tuple[str, ...], float] = defaultdict(float)
@@ -142,18 +143,21 @@ class _Reader:
             for way, share in _known(self.ways, name, who):
                 self._drive(way, veh * share, who)
         by_class_veh: defaultdict[str, float] = defaultdict(float)
-        space_veh_m = 0.0
+        space_veh_m, shortest_m = 0.0, CAR_M[0]
         for name, (veh, who) in self.by_type.items():
             for kind, share in _known(self.kinds, name, who):
                 by_class_veh[kind.vclass] += veh * share
                 if kind.vclass in MOTOR:
-                    space_veh_m += veh * share * kind.space_m
+                    space_veh_m += veh * share * (kind.length_m + kind.gap_m)
+                if kind.vclass in (*MOTOR, "bicycle"):
+                    shortest_m = min(shortest_m, kind.length_m)
         total_veh = sum(veh for vclass, veh in by_class_veh.items() if vclass in MOTOR)
         return Traffic(
             turned_veh=dict(self.turned_veh),
             space_m=space_veh_m / total_veh if total_veh else sum(CAR_M),
             by_class_veh=dict(by_class_veh),
             trips_veh=dict(self.trips_veh),
+            shortest_m=shortest_m,
             named_by=self.named_by,
         )
 
@@ -243,8 +247,8 @@ class _Reader:
         """A type, which goes by its own name too where it stands in a distribution."""
         vclass = element.get("vClass", CAR)
         length_m, gap_m = LENGTH_AND_GAP_M.get(vclass, CAR_M)
-        space_m = self._number(element, "length", length_m) + self._number(element, "minGap", gap_m)
-        kind = [(_Kind(vclass, space_m), 1.0)]
+        size = self._number(element, "length", length_m), self._number(element, "minGap", gap_m)
+        kind = [(_Kind(vclass, *size), 1.0)]
         self.kinds[element.get("id", "")] = kind
         return kind
 

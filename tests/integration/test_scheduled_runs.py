@@ -196,8 +196,8 @@ def test_buses_with_a_stage_of_their_own_are_served_under_schedules(cars_every_s
     assert_safe(result)
     buses = waits_s(tmp_path / "out", "bus")
     assert len(buses) >= 15
-    # What is reported is what they wait.
-    assert max(buses) <= result["longest_red_s"] + 30 <= 210
+    # Two reds of the longest at the most: the least green may be over before the second of two has gone.
+    assert max(buses) < 2 * 180
 
 
 def test_who_has_an_arrow_of_four_seconds_only_is_served_under_schedules(tmp_path: Path) -> None:
@@ -219,3 +219,51 @@ def test_who_ends_amid_a_road_is_not_taken_to_be_there_until_the_control_step_en
         delays_s.append(result["mean_delay_s"])
     # The cycle is nothing to schedules but the time from one estimate to the next.
     assert delays_s[1] < 1.3 * delays_s[0]
+
+
+@pytest.mark.parametrize("cars_every_s", [None, 900])
+def test_bicycles_on_a_lane_of_their_own_are_served_though_hardly_a_car_calls(
+    cars_every_s: float | None, tmp_path: Path
+) -> None:
+    odd_nets.row("C", lanes=2, only={0: "bicycle"}).net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    main = "".join(odd_nets.flow(f"{a}{b}", f"{a}-C", f"C-{b}", period=8, end=1200) for a, b in ("WE", "EW"))
+    riders = odd_nets.flow("bike", "nC-C", "C-sC", type="bike", period=60, end=1200, departLane=0)
+    rare = odd_nets.flow("rare", "sC-C", "C-nC", period=cars_every_s, end=1200) if cars_every_s else ""
+    file = odd_nets.case(tmp_path, '<vType id="bike" vClass="bicycle"/>' + main + riders + rare, end="1200")
+    result = bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / "out")
+    assert_safe(result)
+    assert max(waits_s(tmp_path / "out", "bike")) < 200
+
+
+@pytest.mark.parametrize("vclass", ["bicycle", "motorcycle", "moped"])
+def test_vehicles_shorter_than_cars_are_seen_at_the_line(vclass: str, tmp_path: Path) -> None:
+    odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    routes = odd_nets.traffic("C", type="short", period=40, end=900)
+    file = odd_nets.case(tmp_path, f'<vType id="short" vClass="{vclass}"/>' + routes, end="960")
+    delays_s = {
+        each: bridge.run(scenario(net=str(file), controller=each), tmp_path / each)
+        for each in ("actuated", "recommended")
+    }
+    assert_safe(delays_s["recommended"])
+    assert delays_s["recommended"]["longest_red_s"] < 60
+    assert delays_s["recommended"]["mean_delay_s"] < 1.1 * delays_s["actuated"]["mean_delay_s"]
+
+
+def test_cars_parked_beside_a_quiet_road_do_not_call_for_its_green(tmp_path: Path) -> None:
+    odd_nets.row("C", lanes=2).net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    parked = "".join(
+        f'<trip id="parked{arm}" depart="0" departLane="0" from="{arm}-C" to="C-{to}">'
+        f'<stop lane="{arm}-C_0" endPos="160" duration="1500"/></trip>'
+        for arm, to in (("nC", "sC"), ("sC", "nC"))
+    )
+    flows = (("W", "E", 700), ("E", "W", 700), ("nC", "sC", 50), ("sC", "nC", 50))
+    traffic = "".join(
+        odd_nets.flow(f"{a}{b}", f"{a}-C", f"C-{b}", vehsPerHour=rate, begin=1, end=1100) for a, b, rate in flows
+    )
+    delays_s = []
+    for before in ("", parked):
+        file = odd_nets.case(tmp_path, before + traffic, end="1200")
+        result = bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / f"out{len(before)}")
+        assert_safe(result)
+        delays_s.append(result["mean_delay_s"])
+    assert delays_s[1] < 1.2 * delays_s[0]

@@ -84,6 +84,20 @@ def test_lanes_part_where_one_stands_behind_who_has_red_while_another_goes() -> 
     assert [lanes for lanes, _ in lane_sets(ways, ["GGGr", "rrrG"])] == [(0,), (1,)]
     for alike in (["GGGG", "rrrr"], ["GGGG", "Grrr"], ["GGGG", "GrrG"]):
         assert [lanes for lanes, _ in lane_sets(ways, alike)] == [(0, 1)]
+    # Or one has red while another goes.
+    assert [lanes for lanes, _ in lane_sets(ways, ["GGGG", "rrGG"])] == [(0,), (1,)]
+
+
+def test_lanes_for_buses_are_sets_of_their_own_that_hardly_anybody_takes(street_of: StreetOf) -> None:
+    alike = {0: {8: {0}}, 1: {8: {1}}, 2: {8: {2}}}
+    assert [lanes for lanes, _ in lane_sets(alike, ["GGG", "rrr"], {0})] == [(0,), (1, 2)]
+    network = street_of(odd_nets.bus_lanes)
+    streams = Streams(network)
+    share = streams.shares(network.fraction).set_of_link
+    reserved = np.array([each.is_reserved for each in network.lane_sets])
+    assert reserved.sum() == len(network.links)
+    assert (share[reserved] < 0.1).all()
+    assert np.bincount(network.set_link, share) == pytest.approx(np.ones(len(network.links)))
 
 
 def test_who_has_a_choice_of_lanes_takes_the_emptier_ones(street_of: StreetOf) -> None:

@@ -24,7 +24,7 @@ A_BIN = 1.0
 
 def looked(outlook: Outlook, view: Scene) -> tuple[Floats, Floats]:
     """(N,) who stands and (N, K) who comes."""
-    return outlook.look(view, view.zone_veh(view.free))[:2]
+    return outlook.look(view, view.zone_veh(view.free), np.zeros(len(view.x_veh)))[:2]
 
 
 class Road:

@@ -134,7 +134,7 @@ def test_windows_side_by_side_hold_what_the_whole_holds(
 def test_departures_outside_the_window_weigh_nothing(content: str, tmp_path: Path) -> None:
     found = traffic(tmp_path, content, begin_s=100.0, end_s=200.0)
     assert (found.turned_veh, found.by_class_veh, found.named_by) == ({}, {}, {})
-    assert found.space_m == 7.5
+    assert (found.space_m, found.shortest_m) == (7.5, 5.0)
 
 
 def test_what_sumo_scales_is_scaled(tmp_path: Path) -> None:
@@ -174,6 +174,7 @@ def test_room_is_the_mean_of_what_drives(tmp_path: Path) -> None:
     # The bicycle takes no room on the cars' lanes.
     metres = 20.5 + 7.5 + (9.6 + 3 * 7.5) + (9.6 + 6.0)
     assert found.space_m == pytest.approx(metres / 8)
+    assert found.shortest_m <= 5.0
 
 
 def test_lengths_and_gaps_are_sumo_s_own(utn17: Network, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from utn_controllers.scheduled.ending import Ending
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
+from utn_controllers.scheduled.parked import Parked
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
@@ -71,6 +72,7 @@ class Scheduled:
             starving=self.settings.starving,
             full=self.settings.full,
         )
+        self._parked = Parked(network, self._streams)
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
         moves = Moves(network, self._streams, BIN_S)
@@ -116,8 +118,9 @@ class Scheduled:
         if self._due:
             return self._sooner(view)
         zones, present = view.zone_veh(view.free), self._row[view.stage]
+        parked_veh = self._parked.leave_out(view.time_s, view.free, present, zones[0])
         outlook = self._outlook
-        stand, come, held = outlook.look(view, zones)
+        stand, come, held = outlook.look(view, zones, parked_veh)
         stuck = self._standstill.look(view, present, stand)
         self._yielding.look(view, view.free, present, zones[0])
         worth, most = self._worth.look(

@@ -70,18 +70,19 @@ class Outlook:
         self.shares = self.streams.shares(fraction)
         self._group_share = self.network.group_shares(fraction)
 
-    def look(self, view: Seen, zones: tuple[Floats, Floats]) -> tuple[Floats, Floats, Floats]:
+    def look(self, view: Seen, zones: tuple[Floats, Floats], parked_veh: Floats) -> tuple[Floats, Floats, Floats]:
         """(N,) vehicles by the stop line, (N, K) those that could be in each bin. A bin has gone by since.
 
         By the vehicles in `zones` (View.zone_veh) before junctions that are free: before others, who decide nothing
-        now, there are none. And (G,) by how much more those weigh who hold others up.
+        now, there are none. Those who are parked, `parked_veh` (Z,), are not among them. And (G,) by how much more
+        those weigh who hold others up.
         """
         self._now = (self._now + 1) % len(self._came)
         streams, network = self.streams, self.network
         stand, come, held = _look(
             view.free,
             *zones,
-            view.x_veh,
+            view.x_veh - parked_veh,
             view.entered_veh,
             self._before_veh,
             self._came,

@@ -9,10 +9,14 @@ import numpy as np
 
 from utn_sumo.clearances import GREEN
 from utn_sumo.compiling import compiled
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import Bools, Floats, Ints, LaneSet, Network
 
 ROUNDS = 20
 """Over the turns that have a choice of lanes: after so many the lanes' loads are as even as they get."""
+
+
+RESERVED = 0.05
+"""Of what a lane for all has of traffic that one for buses has."""
 
 
 class Shares(NamedTuple):
@@ -40,7 +44,8 @@ class Streams:
         """(S,) the network's stage of each row."""
         self.first_stage = np.cumsum([0, *(len(junction.stages) for junction in network.junctions)])
         """(J + 1,) rows where the junctions' stages begin."""
-        self._lanes = np.array([len(lane_set.lanes) for lane_set in network.lane_sets], dtype=float)
+        self._lanes = np.array([_taken(lane_set) for lane_set in network.lane_sets])
+        """(L,) by which those share traffic that has the choice."""
         ways = [
             (lane_set, turn, letters)
             for lane_set, each in enumerate(network.lane_sets)
@@ -99,6 +104,10 @@ class Streams:
         least = np.maximum(load, 1e-9)
         way_of_set = signalled / least[self.lane_set[self.way_stream]]
         return Shares(of_link, of_link / least[self.lane_set], way_of_set, load)
+
+
+def _taken(lane_set: LaneSet) -> float:
+    return len(lane_set.lanes) * (RESERVED if lane_set.is_reserved else 1.0)
 
 
 def _choices(way_turn: Ints) -> Ints:

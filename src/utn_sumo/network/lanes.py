@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from utn_sumo.clearances import GIVES_WAY, GREEN
 
@@ -26,13 +26,15 @@ def lane_groups(turns: Iterable[tuple[str, Iterable[int]]]) -> list[tuple[tuple[
     return sorted((tuple(sorted(lanes)), tuple(sorted(names))) for lanes, names in groups)
 
 
-def lane_sets(ways: Mapping[int, Ways], states: Iterable[str]) -> list[tuple[tuple[int, ...], Ways]]:
+def lane_sets(
+    ways: Mapping[int, Ways], states: Iterable[str], reserved: Collection[int] = ()
+) -> list[tuple[tuple[int, ...], Ways]]:
     """The sets into which the lanes of one group part, with their ways, from the ways of each lane.
 
     All lanes move alike and are one set where in none of the junction's `states` somebody of the group gives way, nor
     one lane goes while who is first in another one may have red. Else a lane from which somebody waits for gaps is
     slower than one without, one behind a red arrow stands, and lanes are a set if they have the same turns by signals
-    that always show the same.
+    that always show the same. Lanes `reserved` for buses are never one with others: hardly anybody takes them.
     """
     shown = list(states)
     letters = {letter for own in ways.values() for each in own.values() for letter in each}
@@ -41,7 +43,7 @@ def lane_sets(ways: Mapping[int, Ways], states: Iterable[str]) -> list[tuple[tup
     found: dict[str, list[int]] = {}
     for lane, own in ways.items():
         moves = [(turn, sorted({"".join(state[each] for state in shown) for each in own[turn]})) for turn in own]
-        found.setdefault("" if together else repr(moves), []).append(lane)
+        found.setdefault(f"{lane in reserved}{'' if together else moves}", []).append(lane)
     sets: list[tuple[tuple[int, ...], Ways]] = []
     for lanes in found.values():
         whole: dict[int, set[int]] = {}

@@ -18,7 +18,7 @@ from utn_sumo.errors import NetworkError, did_you_mean
 from utn_sumo.network import programmes
 from utn_sumo.network.lanes import lane_groups, lane_sets
 from utn_sumo.network.programmes import MIN_GREEN_S, SHORT_GREEN_S, Block, Phase
-from utn_sumo.network.roads import Chain, Roads, for_motors, leads_on, motor_lanes, usual_weight
+from utn_sumo.network.roads import Chain, Roads, for_motors, leads_on, motor_lanes, reserved_lanes, usual_weight
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
 from utn_sumo.xml_files import opened, stem
@@ -173,6 +173,7 @@ class _Reader:
         self.usual_green_s = usual_green_s
         self.coming_veh = None if traffic is None else _coming_veh(net, traffic)
         self.space_m = SPACE_PER_VEHICLE_M if traffic is None else traffic.space_m
+        self.said: dict[str, float] = {} if traffic is None else {"shortest_m": traffic.shortest_m}
         # Approach edge -> position of the junction that it enters.
         self.junction_of = {edge: position for position, signal in enumerate(signals) for edge in signal.approaches}
         self.approaches = sorted(self.junction_of, key=_natural)
@@ -222,6 +223,7 @@ class _Reader:
             edge_length_m={edge: self.net.getEdge(edge).getLength() for edge in edges},
             startup_lag_s=STARTUP_LAG_S,
             left_alone=left_alone,
+            **self.said,
         )
 
     def _link(self, chain: Chain, fed: bool) -> Link:
@@ -299,10 +301,17 @@ class _Reader:
         for stage in stages:
             states[stage.junction].append(stage.state)
         shown = [states[self.junction_of[self.approaches[group.link]]] for group in groups]
+        reserved = [reserved_lanes(self.net.getEdge(self.approaches[group.link])) for group in groups]
         return [
-            LaneSet(group, lanes, tuple(own), tuple(tuple(sorted(each)) for each in own.values()))
+            LaneSet(
+                group,
+                lanes,
+                tuple(own),
+                tuple(tuple(sorted(each)) for each in own.values()),
+                is_reserved=lanes[0] in reserved[group],
+            )
             for group, (by_lane, of_junction) in enumerate(zip(ways, shown, strict=True))
-            for lanes, own in lane_sets(by_lane, of_junction)
+            for lanes, own in lane_sets(by_lane, of_junction, reserved[group])
         ]
 
     def _shares(self, edge_id: str, connections: Mapping[str, list[Any]]) -> list[float]:

@@ -23,6 +23,11 @@ def motor_lanes(edge: Any) -> tuple[int, ...]:
     return tuple(lane.getIndex() for lane in edge.getLanes() if _admits_motors(lane))
 
 
+def reserved_lanes(edge: Any) -> frozenset[int]:
+    """Numbers of its lanes for motor vehicles that no car may use, as those for buses."""
+    return frozenset(index for index in motor_lanes(edge) if not edge.getLane(index).allows("passenger"))
+
+
 def _admits_motors(lane: Any) -> bool:
     return any(lane.allows(vehicle) for vehicle in MOTOR)
 

@@ -38,6 +38,8 @@ class Traffic:
     trips_veh: Mapping[tuple[str, ...], float]
     """Those among them whose way SUMO finds itself, by the edges that it leads from, via and to: they are in no
     `turned_veh`. What begins or ends elsewhere than on an edge has fewer than two."""
+    shortest_m: float
+    """Length of the shortest vehicle that drives on a road; a passenger car's where none is shorter."""
     named_by: Mapping[str, str]
     """Edges on their ways, as far as these are known, and who names each of them first."""
 

@@ -153,13 +153,18 @@ def _ways(network: Network) -> tuple[Ints, Bools]:
 
 
 def _walks(network: Network) -> Bools:
-    """(S, walks) which letters that are not of motor traffic each stage has green for: who walks, trams, bicycles."""
-    walks = [
-        (index, letter)
-        for index, junction in enumerate(network.junctions)
-        for letter, turns in enumerate(junction.signal_turns)
-        if not turns
-    ]
+    """(S, walks) which letters that are not of motor traffic each stage has green for: who walks, trams, bicycles.
+
+    A bicycle lane may turn as the lane for cars beside it does, by a letter of its own.
+    """
+    driven = {
+        (int(network.link_junction[link]), letter)
+        for link, lane_set in zip(network.set_link, network.lane_sets, strict=True)
+        for way in lane_set.letters
+        for letter in way
+    }
+    letters = ((index, letter) for index, each in enumerate(network.junctions) for letter in range(len(each.conflicts)))
+    walks = [each for each in letters if each not in driven]
     green = [
         [stage.junction == index and stage.state[letter] in clearances.GREEN for index, letter in walks]
         for stage in network.stages
