@@ -116,7 +116,7 @@ def test_where_no_number_has_both_bounds_all_choices_are_searched() -> None:
     ("controller", "over", "named"),
     [
         ("max_wav", (), "did you mean 'max_wave'"),
-        ("fixed", (), "has no pydantic `Settings`"),
+        ("fixed", (), "has no settings that say what they may be"),
         ("dmpc", ("execution.gap_s=1:3",), "has no setting 'execution.gap_s'"),
         ("max_wave", ("evry_s=1:2",), "did you mean 'every_s'"),
         ("max_wave", ("every_s=0:2",), "greater than or equal to 1"),
