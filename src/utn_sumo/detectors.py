@@ -35,8 +35,8 @@ CREEPING_M_S = 3.0
 """Who is slower amid a junction has not got away from it: with whom he stood behind gone, he may stop for others."""
 CAR_M = 5.0
 """The detector of a zone ends so much before the zone: it sees a car until its back has gone by."""
-AMISS_M = 0.5
-"""By how much nearer to the line the zone next to it ends than the back of who is shorter than a car."""
+INTO_M = 0.5
+"""The zone next to the line ends so far into the shortest vehicle there, where that is shorter than a car."""
 LEAST_M = 0.1
 """Shortest detector that SUMO takes."""
 ROUNDING = 1e-6
@@ -194,9 +194,9 @@ def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, f
             # Less of a zone than that on an edge begins before the zone does.
             begin_m = max(min(from_m, length_m[edge] - LEAST_M), 0.0)
             # By the line a shorter vehicle would never be seen.
-            short_m = max(network.shortest_m - AMISS_M, AMISS_M)
-            length_seen_m = short_m if zone == 0 and network.shortest_m < CAR_M else CAR_M
-            pieces.append((f"zone{zone}", edge, begin_m, max(to_m - length_seen_m, begin_m + LEAST_M)))
+            is_short = zone == 0 and network.shortest_m < CAR_M
+            behind_m = max(network.shortest_m - INTO_M, INTO_M) if is_short else CAR_M
+            pieces.append((f"zone{zone}", edge, begin_m, max(to_m - behind_m, begin_m + LEAST_M)))
         for kind, edge, from_m, to_m in pieces:
             for lane in network.edge_lanes[edge]:
                 yield kind, f"{edge}_{lane}", from_m, to_m

@@ -11,6 +11,7 @@ from pydantic.fields import FieldInfo
 
 from utn_sumo.controllers import CONTROLLER, EXECUTION, Kind, maker, registered, settings_of
 from utn_sumo.errors import ControllerError, did_you_mean
+from utn_sumo.search_space import kind_of
 
 BOUNDS = {"ge": "from {} on", "gt": "over {}", "le": "up to {}", "lt": "under {}"}
 
@@ -81,8 +82,7 @@ def _default(value: Any) -> str:
 
 def _may_be(field: FieldInfo) -> str:
     """The values that a setting takes, in words."""
-    kinds = [each for each in get_args(field.annotation) if each is not type(None)]
-    kind: Any = kinds[0] if len(kinds) == 1 and get_origin(field.annotation) is not Literal else field.annotation
+    kind = kind_of(field)
     if get_origin(kind) is Literal:
         return ", ".join(map(str, get_args(kind)))
     if kind is bool:

@@ -168,7 +168,7 @@ def _fields(models: Mapping[str, type[BaseModel]]) -> dict[str, FieldInfo]:
     return {prefix + name: field for prefix, model in models.items() for name, field in model.model_fields.items()}
 
 
-def _kind(field: FieldInfo) -> Any:
+def kind_of(field: FieldInfo) -> Any:
     """The type of a setting, None aside."""
     kinds = [each for each in get_args(field.annotation) if each is not type(None)]
     return kinds[0] if len(kinds) == 1 and get_origin(field.annotation) is not Literal else field.annotation
@@ -176,7 +176,7 @@ def _kind(field: FieldInfo) -> Any:
 
 def _own(field: FieldInfo) -> Range | Choice | None:
     """The range or choices that a setting has by itself."""
-    kind = _kind(field)
+    kind = kind_of(field)
     if kind is bool:
         return Choice((False, True))
     if get_origin(kind) is Literal:
@@ -193,7 +193,7 @@ def _own(field: FieldInfo) -> Range | Choice | None:
 
 def _said(text: str, field: FieldInfo, where: str) -> Range | Choice:
     """The range or choices that a user gives a setting; each value is checked as the controller would."""
-    kind, (low, colon, high) = _kind(field), where.partition(":")
+    kind, (low, colon, high) = kind_of(field), where.partition(":")
     words = [low, high] if colon else where.split(",")
     bounded: Any = Annotated[field.annotation, field]
     check: TypeAdapter[Any] = TypeAdapter(bounded)

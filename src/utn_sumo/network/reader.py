@@ -173,7 +173,7 @@ class _Reader:
         self.usual_green_s = usual_green_s
         self.coming_veh = None if traffic is None else _coming_veh(net, traffic)
         self.space_m = SPACE_PER_VEHICLE_M if traffic is None else traffic.space_m
-        self.said: dict[str, float] = {} if traffic is None else {"shortest_m": traffic.shortest_m}
+        self.shortest_m = Network.shortest_m if traffic is None else traffic.shortest_m
         # Approach edge -> position of the junction that it enters.
         self.junction_of = {edge: position for position, signal in enumerate(signals) for edge in signal.approaches}
         self.approaches = sorted(self.junction_of, key=_natural)
@@ -222,8 +222,8 @@ class _Reader:
             edge_lanes={edge: motor_lanes(self.net.getEdge(edge)) for edge in edges},
             edge_length_m={edge: self.net.getEdge(edge).getLength() for edge in edges},
             startup_lag_s=STARTUP_LAG_S,
+            shortest_m=self.shortest_m,
             left_alone=left_alone,
-            **self.said,
         )
 
     def _link(self, chain: Chain, fed: bool) -> Link:
