@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from utn_sumo.callers import served
 from utn_sumo.contract import Ints, Junction, Network, Plan, State, View
 
 
@@ -30,8 +32,8 @@ class _Way:
     """From one stage to another one of its junction."""
 
     stage: int
-    is_walked: bool
-    """Whether pedestrians go in it, whom no detector sees."""
+    callers: tuple[int, ...]
+    """People, bicycles and trams whom it serves and the first stage does not."""
     calls: tuple[int, ...]
     """Lane groups that need it: the first stage has no protected green for them."""
     serves: tuple[int, ...]
@@ -92,7 +94,9 @@ class Actuated:
         end_s = self._cycle_s[index] + self._end_s[present]
         late = view.time_s >= end_s
         for way in self._ways[present]:
-            if way.is_walked or any(view.near_one_veh(group) > 0 for group in (way.serves if late else way.calls)):
+            if any(view.calling[caller] > 0 for caller in way.callers):
+                break
+            if any(view.near_one_veh(group) > 0 for group in (way.serves if late else way.calls)):
                 break
         else:
             # With nobody elsewhere the cycle's time stands still.
@@ -110,6 +114,7 @@ def _ways(network: Network, junction: Junction) -> dict[int, tuple[_Way, ...]]:
     """Of each stage the ways to the others, in the order of the cycle."""
     stages = junction.stages
     serves = {stage: _groups(network, network.stages[stage].turns) for stage in stages}
+    called = served(network)
     protected = {stage: _groups(network, _protected(network, junction, stage)) for stage in stages}
 
     def way(first: int, then: int) -> _Way:
@@ -118,7 +123,7 @@ def _ways(network: Network, junction: Junction) -> dict[int, tuple[_Way, ...]]:
         everyone = serves[then] | _groups(network, held)
         return _Way(
             then,
-            any(item.state[letter] in "Gg" for letter in junction.without_yellow),
+            tuple(np.flatnonzero(called[then] & ~called[first]).tolist()),
             tuple(sorted(everyone - protected[first])),
             tuple(sorted(everyone)),
             tuple(sorted(serves[first] - protected[then])),

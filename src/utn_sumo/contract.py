@@ -3,8 +3,8 @@
     plant -> Measurement -> State -> Forecast -> Plan -> (checked) -> plant
 
 Counts are in veh, times in s, lengths in m, rates in veh/s unless a name says otherwise. Index
-spaces: Z links, M turns (one per link and next link or exit), G lane groups, L lane sets, S stages, J junctions, Kp and
-Kc horizons.
+spaces: Z links, M turns (one per link and next link or exit), G lane groups, L lane sets, S stages, J junctions, C
+callers, Kp and Kc horizons.
 """
 
 from __future__ import annotations
@@ -131,6 +131,17 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class Caller:
+    """Who has letters of a signal and is no motor traffic: people, bicycles, trams. He says himself that he is there."""
+
+    letter: int
+    buttons: tuple[tuple[str, str], ...] = ()
+    """Walking area and crossing, SUMO's edges: in the one a button stands for who wants to go over the other."""
+    lanes: tuple[str, ...] = ()
+    """Lanes for bicycles or trams alone that end at the stop line."""
+
+
+@dataclass(frozen=True)
 class Junction:
     """A signalled junction: its stages in the order of its cycle, and which signals conflict."""
 
@@ -146,6 +157,8 @@ class Junction:
     """Letters that need none: pedestrian crossings', and those of no stream."""
     made_to_yield: tuple[int, ...] = ()
     """Letters that give way (g) in stages in which the net itself protects them (G) beside others that they meet."""
+    callers: tuple[Caller, ...] = ()
+    """In the order of their letters."""
 
     @property
     def is_walked(self) -> bool:
@@ -241,6 +254,11 @@ class Network:
         for junction in self.junctions:
             free[[turn for turns in junction.signal_turns for turn in turns]] = False
         return free
+
+    @cached_property
+    def callers(self) -> tuple[tuple[int, Caller], ...]:
+        """(C,) those who call for green themselves, one junction's after the other's, and at which they do."""
+        return tuple((index, caller) for index, junction in enumerate(self.junctions) for caller in junction.callers)
 
     @cached_property
     def held_greens(self) -> tuple[HeldGreen, ...]:
@@ -701,6 +719,11 @@ class View(Protocol):
     @property
     def left_veh(self) -> Floats:
         """(L,) vehicles that have left over the stop line of each lane set since the run began."""
+        ...
+
+    @property
+    def calling(self) -> Floats:
+        """(C,) of each caller how many of its buttons are pressed, and on how many of its lanes somebody is close."""
         ...
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:

@@ -9,7 +9,7 @@ turns apart. All report once a control step, which is when they are read: interv
 
 Where an execution decides within the control step, more lane-area detectors cut the same 200 m into zones, and some see
 who waits amid a junction because their green gives way to others, or behind these, or who is amid it late where people
-walk.
+walk, or bicycles and trams on lanes of their own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from utn_sumo.clearances import GIVES_WAY
-from utn_sumo.contract import ZONES_M, Floats, LaneSet, Link, Measurement, Network, Turn
+from utn_sumo.contract import CLOSE_ZONES, ZONES_M, Floats, LaneSet, Link, Measurement, Network, Turn
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -33,6 +33,8 @@ TURN_M = 1.0
 """Turn loops stand this far behind the stop line."""
 CREEPING_M_S = 3.0
 """Who is slower amid a junction has not got away from it: with whom he stood behind gone, he may stop for others."""
+CALLING_M = ZONES_M[CLOSE_ZONES - 1]
+"""Bicycles and trams on lanes of their own are seen so far before the stop line."""
 CAR_M = 5.0
 """The detector of a zone ends so much before the zone: it sees a car until its back has gone by."""
 INTO_M = 0.5
@@ -71,6 +73,8 @@ class DetectorIds:
     """(Z, zones) those before the lane groups part."""
     amid: tuple[tuple[str, ...], ...]
     """(M,) of the lane-area detectors amid junctions those on which each turn may wait, else none."""
+    calling: tuple[tuple[str, ...], ...]
+    """(C,) of the lane-area detectors those on the lanes of each caller."""
 
 
 def ids(network: Network) -> DetectorIds:
@@ -127,6 +131,7 @@ def ids(network: Network) -> DetectorIds:
         set_zone=tuple(in_zones(link, of_set(link, lane_set)) for link, lane_set in sets),
         upstream_zone=tuple(in_zones(index, before(link)) for index, link in enumerate(network.links)),
         amid=tuple(tuple(_named("amid", lane) for lane in lanes) for lanes in _amid(network)),
+        calling=tuple(tuple(_named("call", lane) for lane in caller.lanes) for _, caller in network.callers),
     )
 
 
@@ -202,6 +207,8 @@ def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, f
                 yield kind, f"{edge}_{lane}", from_m, to_m
     for via in (via for lanes in _amid(network) for via in lanes if within_step):
         yield "amid", via, 0.0, NEARLY_M
+    for lane in sorted({lane for _, caller in network.callers for lane in caller.lanes}) if within_step else ():
+        yield "call", lane, -CALLING_M, NEARLY_M
 
 
 def write(network: Network, path: Path, period_s: float, *, within_step: bool = False) -> None:

@@ -29,6 +29,7 @@ class Scene:
     set_link: Ints
     set_junction: Ints
     link_junction: Ints
+    calling: Floats
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
         return (
@@ -78,4 +79,5 @@ def scene(
         network.set_link,
         network.link_junction[network.set_link],
         network.link_junction,
+        np.zeros(len(network.callers)),
     )

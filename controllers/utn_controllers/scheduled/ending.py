@@ -27,9 +27,10 @@ class Ending:
     def __init__(self, streams: Streams, clearance: Ints):
         """`clearance` (S, most stages of a junction) in bins, as in `Rules`."""
         self._streams = streams
-        staying_bins = staying(lost(streams.first_stage, clearance))
-        self._staying = np.repeat(staying_bins, np.diff(streams.first))
-        self._weight = NEEDING_OF_STAYING * (staying_bins - LEAST_STAYING_BINS)
+        self.staying_bins = staying(lost(streams.first_stage, clearance))
+        """(J,) that who is left waits longer."""
+        self._staying = np.repeat(self.staying_bins, np.diff(streams.first))
+        self._weight = NEEDING_OF_STAYING * (self.staying_bins - LEAST_STAYING_BINS)
         self._needing = np.zeros(len(streams.link))
 
     def take_up(self, come_veh: Floats, most_veh: Floats) -> None:

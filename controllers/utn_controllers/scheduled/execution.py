@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from utn_controllers.scheduled.calling import Calling
 from utn_controllers.scheduled.ending import Ending
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
@@ -75,13 +76,14 @@ class Scheduled:
         self._parked = Parked(network, self._streams)
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
-        moves = Moves(network, self._streams, BIN_S)
+        self._calling = Calling(network, self._streams)
+        moves = Moves(network, self._calling, BIN_S)
         self._yielding = Yielding(network, self._streams, moves.share)
-        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S)
+        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, moves.share.shape[1])
         self._rules = Rules(
             stages,
             self._streams.first_stage,
-            self._streams.first,
+            self._calling.first,
             self._orders(),
             moves.share,
             moves.going,
@@ -93,6 +95,8 @@ class Scheduled:
         self._ending = Ending(self._streams, moves.bins)
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules."""
+        self._sent_veh = np.zeros((len(self._calling.letters), bins))
+        """(A, K) what each stream sends off by them."""
         self._row = np.argsort(stages)
         """(S,) row of the rules in which each of the network's stages is."""
         self._due: list[tuple[int, int]] = []
@@ -136,14 +140,13 @@ class Scheduled:
             view.free,
             rest,
             self._rules,
-            stand,
-            come,
-            worth,
-            self._ending.weights(worth),
-            most,
+            *self._calling.join(
+                view.calling, self._ending.staying_bins, stand, come, worth, self._ending.weights(worth), most
+            ),
             self._plan,
-            outlook.sent_veh,
+            self._sent_veh,
         )
+        outlook.sent_veh = self._sent_veh[self._calling.motors]
         self._due = [(index, int(then[index])) for index in (then != wish).nonzero()[0].tolist()]
         self.every_s = SOONER_S if self._due else BIN_S
         return np.asarray(wish)
@@ -173,7 +176,8 @@ class Scheduled:
         stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
         zones = np.zeros((len(self.network.lane_sets), len(ZONES_M))), np.zeros((len(none), len(ZONES_M)))
-        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody))
+        calling = np.zeros(len(self.network.callers))
+        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody, calling))
 
     def _take_up(self) -> None:
         self._giving.take_up(self._outlook.shares.way_of_set)
@@ -202,6 +206,7 @@ class _Nobody:
     x_veh: Floats
     entered_veh: Floats
     left_veh: Floats
+    calling: Floats
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:  # noqa: ARG002 - nobody is anywhere
         return self.zones

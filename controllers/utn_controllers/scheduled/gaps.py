@@ -38,8 +38,8 @@ class Gaps(NamedTuple):
 class Giving:
     """Keeps which share of each lane set waits for gaps."""
 
-    def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float):
-        """But for the lane sets whose discharge in a stage is `learnt` (S, L)."""
+    def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, most: int):
+        """But for the lane sets whose discharge in a stage is `learnt` (S, L); junctions have `most` streams or fewer."""
         self._streams = streams
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
         """(S, V) signalled ways that wait for gaps in a stage."""
@@ -54,10 +54,9 @@ class Giving:
                     own = _foes(network, streams, row, int(stage), way)
                     self._waits[row, way] = len(own) > 0
                     foes.setdefault((row, int(streams.lane_set[stream])), set()).update(own)
-        most = max((len(own) for own in foes.values()), default=0)
-        shape = len(streams.stage), int(np.diff(streams.first).max(initial=0))
+        shape, most_foes = (len(streams.stage), most), max((len(own) for own in foes.values()), default=0)
         self.gaps = Gaps(
-            np.zeros(shape), np.full((*shape, most + 1), -1), np.zeros(shape[0], dtype=np.bool_), GAP_S / bin_s
+            np.zeros(shape), np.full((*shape, most_foes + 1), -1), np.zeros(shape[0], dtype=np.bool_), GAP_S / bin_s
         )
         for row, stage in enumerate(streams.stage):
             first, last = streams.first[network.stage_junction[stage] :][:2]

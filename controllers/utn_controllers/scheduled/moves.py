@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from utn_controllers.scheduled.calling import Calling
 from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo import clearances
@@ -48,7 +49,7 @@ class Rules(NamedTuple):
 class Moves:
     """Which share of its discharge each stream of a junction has, by bins, in rows (R): the stages', clearances'."""
 
-    def __init__(self, network: Network, streams: Streams, bin_s: int):
+    def __init__(self, network: Network, streams: Streams | Calling, bin_s: int):
         sizes, most = np.diff(streams.first), int(np.diff(streams.first_stage).max(initial=1))
         owner = network.stage_junction[streams.stage]
         rows = [

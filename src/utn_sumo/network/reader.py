@@ -207,6 +207,7 @@ class _Reader:
                     conflicts=signal.conflicts,
                     without_yellow=tuple(sorted(walked)),
                     made_to_yield=tuple(sorted({letter for letter, _ in second})),
+                    callers=signal.callers,
                 )
             )
         edges = sorted({edge for link in links for edge in link.edges} | {turn.to_edge for turn in turns})

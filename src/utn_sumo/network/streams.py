@@ -9,6 +9,7 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+from utn_sumo.contract import Caller
 from utn_sumo.errors import NetworkError
 from utn_sumo.network.programmes import Programme
 from utn_sumo.network.roads import STRAIGHT, for_motors
@@ -34,6 +35,22 @@ class Signal:
         used = [*self.of_vehicles, *(index for crossing in crossings for index in crossing.letters)]
         self.used_letters = 1 + max(used, default=-1)
         self.letters = self.used_letters if programme is None else len(programme.phases[0].state)
+
+    @cached_property
+    def callers(self) -> tuple[Caller, ...]:
+        """Who has letters of his own and is no motor traffic."""
+        buttons: dict[int, set[tuple[str, str]]] = {}
+        for crossing in self._walked:
+            for letter in crossing.letters:
+                buttons.setdefault(letter, set()).update((area, crossing.id) for area in crossing.areas)
+        lanes: dict[int, set[str]] = {}
+        for connection, letter in self.connections:
+            lanes.setdefault(letter, set()).add(str(connection.getFromLane().getID()))
+        return tuple(
+            Caller(letter, tuple(sorted(buttons.get(letter, ()))), tuple(sorted(lanes.get(letter, ()))))
+            for letter in sorted((buttons.keys() | self.beside_motors) - self.of_motors)
+            if letter < self.letters
+        )
 
     @cached_property
     def approaches(self) -> list[str]:
@@ -120,6 +137,10 @@ class Crossing:
     letters: tuple[int, ...]
     edges: frozenset[str]
     """Roads that it crosses."""
+    id: str
+    """SUMO's edge."""
+    areas: tuple[str, ...]
+    """Walking areas at its ends, SUMO's edges."""
 
 
 def crossings(path: Path) -> dict[str, list[Crossing]]:
@@ -132,22 +153,30 @@ def crossings(path: Path) -> dict[str, list[Crossing]]:
     inside: dict[str, tuple[str, int]] = {}
     letters: dict[tuple[str, str], tuple[int, ...]] = {}
     edges: dict[str, frozenset[str]] = {}
+    areas: dict[str, set[str]] = {}
     with opened(path) as file:
         for _, element in ElementTree.iterparse(file, forbid_dtd=True):
             if element.tag == "junction" and element.get("type") != "internal":
                 lanes = (element.get("intLanes") or "").split()
                 inside.update({lane: (element.get("id"), number) for number, lane in enumerate(lanes)})
             elif element.tag == "edge" and element.get("function") == "crossing":
-                edges[f"{element.get('id')}_0"] = frozenset((element.get("crossingEdges") or "").split())
-            elif element.tag == "connection" and element.get("tl") and (element.get("to") or "").startswith(":"):
-                names = [element.get(name) for name in ("linkIndex", "linkIndex2")]
-                used = tuple(int(name) for name in names if name and int(name) >= 0)
-                letters.setdefault((element.get("tl"), f"{element.get('to')}_0"), used)
+                edges[element.get("id")] = frozenset((element.get("crossingEdges") or "").split())
+            elif element.tag == "connection":
+                start, end = element.get("from"), element.get("to") or ""
+                if element.get("tl") and end.startswith(":"):
+                    names = [element.get(name) for name in ("linkIndex", "linkIndex2")]
+                    used = tuple(int(name) for name in names if name and int(name) >= 0)
+                    letters.setdefault((element.get("tl"), end), used)
+                for crossing, area in ((end, start), (start, end)):
+                    if crossing in edges:
+                        areas.setdefault(crossing, set()).add(area)
             if element.tag in ("junction", "connection", "edge", "tlLogic"):
                 element.clear()
     found: dict[str, list[Crossing]] = {}
-    for (signal, lane), used in letters.items():
-        if lane in inside:
-            node, request = inside[lane]
-            found.setdefault(signal, []).append(Crossing(node, request, used, edges.get(lane, frozenset())))
+    for (signal, edge), used in letters.items():
+        if f"{edge}_0" in inside:
+            node, request = inside[f"{edge}_0"]
+            ends = tuple(sorted(areas.get(edge, ())))
+            crossing = Crossing(node, request, used, edges.get(edge, frozenset()), edge, ends)
+            found.setdefault(signal, []).append(crossing)
     return found

@@ -13,6 +13,8 @@ import numpy as np
 from utn_sumo.compiling import compiled
 from utn_sumo.contract import CLOSE_ZONES, EXIT, ZONES_M, Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
+from utn_sumo.plant.buttons import Buttons
+from utn_sumo.plant.functions import bare
 from utn_sumo.plant.heads import Heads
 
 COMPARED_S = 10.0
@@ -58,6 +60,7 @@ class Eyes:
             list(chain.from_iterable([*zones[:CLOSE_ZONES], *ids.upstream_zone[link][:CLOSE_ZONES]]))
             for link, zones in zip(self._set_link.tolist(), ids.set_zone, strict=True)
         ]
+        self._buttons = Buttons(network, ids.calling, sumo)
         self._step_s = network.control_step_s
         self._halting = bare(sumo, "lanearea", "getLastStepHaltingNumber")
         self._present = bare(sumo, "lanearea", "getLastStepVehicleNumber")
@@ -87,7 +90,12 @@ class Eyes:
     @property
     def sumo_time_s(self) -> float:
         """Wall time so far inside SUMO's functions, in readings of many detectors at once."""
-        return self._areas.sumo_time_s + self._zones.sumo_time_s + self._entries.sumo_time_s + self._exits.sumo_time_s
+        readers = (self._areas, self._zones, self._entries, self._exits, self._buttons)
+        return sum(reader.sumo_time_s for reader in readers)
+
+    def calling(self) -> Floats:
+        """(C,) of contract.View."""
+        return self._buttons.read()
 
     def standing_veh(self) -> Floats:
         """(L + Z,) standing in the lane-area detectors of lane sets, and of links before their lanes part."""
@@ -265,6 +273,11 @@ class Sight:
         """(G,) in the lane-area detectors, moving or not, by lane group."""
         return self._eyes.near_veh()
 
+    @cached_property
+    def calling(self) -> Floats:
+        """(C,) of each caller how many of its buttons are pressed, and on how many of its lanes somebody is close."""
+        return self._eyes.calling()
+
     @property
     def x_veh(self) -> Floats:
         """(Z,) vehicles on each link: as estimated when the control step began, and counted since."""
@@ -283,9 +296,3 @@ class Sight:
     @cached_property
     def _counted_veh(self) -> tuple[Floats, Floats, Floats]:
         return self._eyes.counted_veh(self.time_s)
-
-
-def bare(sumo: Any, domain: str, getter: str) -> Any:
-    """A function of libsumo, without the one in Python about it where there is one: half of a reading's time."""
-    module = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
-    return getattr(module, f"{domain}_{getter}", None) or getattr(getattr(sumo, domain), getter)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_sumo import clearances
+from utn_sumo import callers, clearances
 from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints, Network, View
 
@@ -36,18 +36,18 @@ def longest_red_s(teleport_s: float) -> float:
 
 
 class Patience:
-    """Keeps since when somebody has been waiting on each way (W), a turn from a lane set, and where people walk."""
+    """Keeps since when somebody has been waiting on each way (W), a turn from a lane set, and each caller (C)."""
 
     def __init__(self, network: Network, held_s: Floats, longest_red_s: float = LONGEST_RED_S):
         """Stages of each junction may begin `held_s` (J,) later than the clearance before is over."""
         self._longest_red_s = longest_red_s
         self._way_set, ways = _ways(network)
         """(W,) lane set of each way."""
-        self._needs = np.hstack([ways, _walks(network)])
-        """(S, W + walks) which ways and which letters of pedestrians each stage has green for."""
+        self._needs = np.hstack([ways, callers.served(network)])
+        """(S, W + C) which ways and which callers each stage has green for."""
         self._served = self._needs.any(axis=0)
         self._junction = network.stage_junction[self._needs.argmax(axis=0)]
-        """(W + walks,) whose stages these are."""
+        """(W + C,) whose stages these are."""
         longest_s = np.zeros(len(network.junctions))
         np.maximum.at(longest_s, network.stage_junction, network.clearance_s)
         self._leaves_s = (longest_s + held_s)[network.stage_junction]
@@ -58,9 +58,9 @@ class Patience:
         self._carefree_s = np.clip(longest_red_s - LOOK_S - all_s, 0.0, PATIENCE * longest_red_s)
         """(J,) before somebody has waited so long all can be served, whoever they are and whatever is wished."""
         self._since_s = np.zeros(self._needs.shape[1])
-        """(W + walks,) since when somebody has been waiting for each, without green meanwhile."""
+        """(W + C,) since when somebody has been waiting for each, without green meanwhile."""
         self._stood_s = np.full(self._needs.shape[1], -np.inf)
-        """(W + walks,) when somebody was last seen standing before each."""
+        """(W + C,) when somebody was last seen standing before each."""
         self._look_s = 0.0
         """When it is looked again who waits."""
         self._next: dict[int, tuple[int, float]] = {}
@@ -83,7 +83,7 @@ class Patience:
 
     def _look(self, view: View) -> None:
         waits, troubled = _look(
-            view.time_s, view.stage, view.set_waiting_veh, self._way_set, self._needs, self._served, self._junction,
+            view.time_s, view.stage, view.set_waiting_veh, view.calling, self._way_set, self._needs, self._served, self._junction,
             self._carefree_s, self._stood_s, self._since_s,
         )  # fmt: skip
         self._next = {
@@ -97,7 +97,7 @@ class Patience:
         """Have the machine code made now, not at the first look."""
         stage = np.array([junction.stages[0] for junction in network.junctions], dtype=np.int64)
         _look(
-            0.0, stage, np.zeros(len(network.lane_sets)), self._way_set, self._needs, self._served, self._junction,
+            0.0, stage, np.zeros(len(network.lane_sets)), np.zeros(len(network.callers)), self._way_set, self._needs, self._served, self._junction,
             self._carefree_s, self._stood_s.copy(), self._since_s.copy(),
         )  # fmt: skip
 
@@ -118,14 +118,14 @@ class Patience:
 
 @compiled
 def _look(
-    time_s: float, stage: Ints, waiting: Floats, way_set: Ints, needs: Bools, served: Bools, junction: Ints,
-    carefree_s: Floats, stood_s: Floats, since_s: Floats,
+    time_s: float, stage: Ints, waiting: Floats, calling: Floats, way_set: Ints, needs: Bools, served: Bools,
+    junction: Ints, carefree_s: Floats, stood_s: Floats, since_s: Floats,
 ) -> tuple[Bools, Bools]:  # fmt: skip
-    """(W + walks,) who waits without green, (J,) where somebody's time may come; keeps `stood_s` and `since_s`."""
+    """(W + C,) who waits without green, (J,) where somebody's time may come; keeps `stood_s` and `since_s`."""
     waits, troubled = np.zeros(len(since_s), np.bool_), np.zeros(len(carefree_s), np.bool_)
     for each in range(len(since_s)):
-        # Pedestrians, trams, bicycles, whom no detector sees, may always be waiting.
-        if each >= len(way_set) or waiting[way_set[each]] > 0:
+        there = waiting[way_set[each]] if each < len(way_set) else calling[each - len(way_set)]
+        if there > 0:
             stood_s[each] = time_s
         is_red = served[each] and not needs[stage[junction[each]], each]
         waits[each] = time_s - stood_s[each] <= PAUSE_S and is_red
@@ -150,23 +150,3 @@ def _ways(network: Network) -> tuple[Ints, Bools]:
         for way in np.flatnonzero(way_junction == stage.junction):
             green[index, way] = any(stage.state[letter] in clearances.GREEN for letter in ways[way][2])
     return way_set, green
-
-
-def _walks(network: Network) -> Bools:
-    """(S, walks) which letters that are not of motor traffic each stage has green for: who walks, trams, bicycles.
-
-    A bicycle lane may turn as the lane for cars beside it does, by a letter of its own.
-    """
-    driven = {
-        (int(network.link_junction[link]), letter)
-        for link, lane_set in zip(network.set_link, network.lane_sets, strict=True)
-        for way in lane_set.letters
-        for letter in way
-    }
-    letters = ((index, letter) for index, each in enumerate(network.junctions) for letter in range(len(each.conflicts)))
-    walks = [each for each in letters if each not in driven]
-    green = [
-        [stage.junction == index and stage.state[letter] in clearances.GREEN for index, letter in walks]
-        for stage in network.stages
-    ]
-    return np.reshape(np.array(green, dtype=np.bool_), (len(network.stages), len(walks)))

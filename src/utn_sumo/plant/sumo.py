@@ -33,7 +33,8 @@ from utn_sumo.contract import (
     View,
 )
 from utn_sumo.errors import PlanError, PlantError
-from utn_sumo.plant.eyes import Eyes, Sight, bare
+from utn_sumo.plant.eyes import Eyes, Sight
+from utn_sumo.plant.functions import bare
 from utn_sumo.plant.heads import Heads
 from utn_sumo.plant.patience import LONGEST_RED_S, longest_red_s
 from utn_sumo.signals import cycle_phases
