@@ -35,6 +35,8 @@ from utn_sumo.prediction import Predictor
 from utn_sumo.scenario import Scenario
 from utn_sumo.supervisor import Decision, Supervisor
 
+WHOLE = 1e-6
+"""By how much a number of steps in a second may be off."""
 UNKNOWN_VEH = 1.0
 """Vehicles that usually come onto a link amid it in a control step, where nobody says how many."""
 
@@ -70,7 +72,7 @@ def run(
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.controller_settings)
     carried_out, execution = controllers.build_execution(scenario, known, controller)
-    if execution is not None and chosen is not None:
+    if chosen is not None:
         _check_step(chosen, carried_out)
     step_s, duration_s = net.control_step_s, _duration_s(scenario, chosen)
     steps = int(np.ceil(duration_s / step_s))
@@ -95,9 +97,10 @@ def run(
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
         recorder, state = recording.Recorder(folder, _settings(scenario, driving, plant.version)), estimator.initial()
+        horizon = controller.horizon
         try:
             for step in range(steps):
-                ahead = predictor.forecast(controller.horizon)
+                ahead = predictor.forecast(horizon)
                 decision = supervisor.ask(state, ahead)
                 seen = miscount.distort(plant.run(decision.plan, state))
                 recorder.write(
@@ -166,10 +169,13 @@ def _duration_s(scenario: Scenario, chosen: Case | None) -> float:
 
 
 def _check_step(chosen: Case, execution: str) -> None:
-    if chosen.step_s > 1:
+    """Raise SettingError for steps with which signals can't be switched as they are meant to be."""
+    in_second = 1 / chosen.step_s
+    # Executions look what time it is; to the second, greens and yellows end where a step does, or one step later.
+    if chosen.step_s > 1 or (execution == "exact" and abs(in_second - round(in_second)) > WHOLE):
         raise SettingError(
             f"scenario {str(chosen.file)!r} has a step-length of {chosen.step_s:g} s: execution {execution!r} switches "
-            "signals to the second, make it 1 s or less"
+            "signals to the second, make it 1 s or a whole part of it, such as 0.5 or 0.2 s"
         )
 
 

@@ -79,7 +79,8 @@ class CasadiOperations:
         return self._casadi.mtimes(self._casadi.DM(matrix.tocsc()), vector)
 
     def take(self, vector: Any, places: Ints) -> Any:
-        return vector[places.tolist()]
+        # Of a vector of one the same place taken twice would be a row.
+        return self._casadi.reshape(vector[places.tolist()], len(places), 1)
 
     def minimum(self, a: Any, b: Any) -> Any:
         return self._casadi.fmin(a, b)

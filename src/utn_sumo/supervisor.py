@@ -7,6 +7,7 @@ run down or an unsafe plan onto the street.
 from __future__ import annotations
 
 import time
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,10 +44,11 @@ class Supervisor:
         """A plan that is safe to apply, whatever the controller does."""
         started = time.perf_counter()
         try:
-            wish = self.controller.plan(state, forecast)
+            # Whatever it writes into what it is told is no matter to anybody else.
+            wish = self.controller.plan(*deepcopy((state, forecast)))
             plan = signals.admit(wish, self.network)
             ahead = [] if wish.ahead_s is None else [Plan(green_s) for green_s in wish.ahead_s]
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - a foreign controller may raise anything
+        except (Exception, SystemExit, GeneratorExit) as error:  # noqa: BLE001 - a foreign one may raise anything
             reason = f"{type(error).__name__}: {error}"
         else:
             self._ahead = ahead

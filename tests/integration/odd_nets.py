@@ -269,6 +269,20 @@ def bicycle_lanes(folder: Path) -> Path:
     return case(folder, bike + traffic("C") + "".join(riders))
 
 
+def one_road(folder: Path) -> Path:
+    """A signal of one road alone, each of whose two turns has a lane and a stage of its own."""
+    streets = Streets()
+    for name, x, y, kind in (("W", -400, 0, ""), ("C", 0, 0, "traffic_light"), ("E", 300, 0, ""), ("N", 0, 300, "")):
+        streets.node(name, x, y, kind or "priority")
+    streets.one_way("W", "C", 2)
+    for end in ("E", "N"):
+        streets.one_way("C", end)
+    for lane, end in enumerate(("C-E", "C-N")):
+        streets.connection("W-C", end, fromLane=lane, toLane=0)
+    retime(streets.net(folder, NO_TURNAROUNDS), tl_logic("C", [(25, "Gr"), (5, "yr"), (25, "rG"), (5, "ry")]))
+    return case(folder, flow("a", "W-C", "C-E", period=6) + flow("b", "W-C", "C-N", period=9))
+
+
 def bus_lanes(folder: Path) -> Path:
     """Two lanes, the right one for buses, which call at a stop 60 m before the signal and at one behind it."""
     row("C", lanes=2, only={0: "bus bicycle"}).net(folder, NO_TURNAROUNDS)
@@ -866,6 +880,7 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     protected_crossings,
     crossing_amid_a_street,
     bicycle_lanes,
+    one_road,
     bus_lanes,
     bus_stage,
     tram_stage,

@@ -87,13 +87,21 @@ def test_without_an_end_controllers_run_until_everybody_has_arrived_too(tmp_path
         assert result["hours"] > 4
 
 
-def test_steps_too_long_to_switch_signals_to_the_second_are_refused_where_they_have_to_be(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("step_s", "refused"), [("2", ("fixed", "dmpc", "recommended")), ("0.8", ("fixed", "dmpc")), ("0.2", ())]
+)
+def test_steps_with_which_signals_can_not_be_switched_to_the_second_are_refused_where_they_have_to_be(
+    step_s: str, refused: tuple[str, ...], tmp_path: Path
+) -> None:
     odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
-    file = odd_nets.case(tmp_path, odd_nets.traffic("C"), options={"step-length": "2"})
-    with pytest.raises(SettingError, match=r"step-length of 2 s: execution 'scheduled' .* make it 1 s or less"):
-        bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / "refused")
-    assert not (tmp_path / "refused").exists()
-    assert bridge.run(scenario(net=str(file), controller="fixed"), tmp_path / "fixed")["unsafe_signal_s"] == 0
+    file = odd_nets.case(tmp_path, odd_nets.traffic("C"), options={"step-length": step_s})
+    for controller in refused:
+        with pytest.raises(SettingError, match=rf"step-length of {step_s} s: execution .* make it 1 s or a whole part"):
+            bridge.run(scenario(net=str(file), controller=controller), tmp_path / controller)
+        assert not (tmp_path / controller).exists()
+    for controller in sorted({"native", "fixed", "dmpc", "recommended"} - set(refused)):
+        result = bridge.run(scenario(net=str(file), controller=controller), tmp_path / controller)
+        assert (result["unsafe_signal_s"], result["unsafe_reasons"]) == (0, [])
 
 
 def test_a_shipped_net_runs_under_its_own_signals_too(tmp_path: Path) -> None:

@@ -36,6 +36,54 @@ def grid() -> Network:
     return one_way_grid(6, 7)
 
 
+def side_by_side(part: Network, copies: int) -> Network:
+    """So many junctions like that of a network of one, with nothing between them."""
+    links, turns, groups, stages = len(part.links), len(part.turns), len(part.groups), len(part.stages)
+    each = range(copies)
+    return replace(
+        part,
+        links=tuple(replace(a, id=f"{a.id}#{n}", junction=n) for n in each for a in part.links),
+        turns=tuple(replace(a, link=a.link + n * links, group=a.group + n * groups) for n in each for a in part.turns),
+        groups=tuple(replace(a, link=a.link + n * links) for n in each for a in part.groups),
+        lane_sets=tuple(
+            replace(a, group=a.group + n * groups, turns=tuple(turn + n * turns for turn in a.turns))
+            for n in each
+            for a in part.lane_sets
+        ),
+        stages=tuple(
+            replace(a, junction=n, turns=tuple(turn + n * turns for turn in a.turns)) for n in each for a in part.stages
+        ),
+        junctions=tuple(
+            replace(
+                a,
+                id=f"{a.id}#{n}",
+                stages=tuple(stage + n * stages for stage in a.stages),
+                signal_turns=tuple(tuple(turn + n * turns for turn in own) for own in a.signal_turns),
+            )
+            for n in each
+            for a in part.junctions
+        ),
+    )
+
+
+def test_many_junctions_with_nothing_to_agree_on_answer_at_once_and_for_ever(utn17: Network) -> None:
+    alone = side_by_side(utn17.part(3), 9)
+    mpc, rng = DistributedMPC(alone), np.random.default_rng(0)
+    for _ in range(3):
+        plan = mpc.plan(random_state(alone, rng), random_forecast(alone, rng, HORIZON))
+        signals.admit(plan, alone)
+        assert (plan.facts["iterations"], plan.facts["converged"]) == (1, True)
+
+
+def test_numbers_that_no_agent_could_bear_do_not_come_back(grid: Network) -> None:
+    mpc, rng = DistributedMPC(grid), np.random.default_rng(0)
+    forecast, state = random_forecast(grid, rng, HORIZON), random_state(grid, rng)
+    mpc.plan(state, forecast)
+    with pytest.raises(ControllerError), np.errstate(all="ignore"):
+        mpc.plan(replace(state, x_veh=np.full(len(grid.links), 1e200)), forecast)
+    signals.admit(mpc.plan(state, forecast), grid)
+
+
 def all_greens(plan: Plan) -> Floats:
     return np.vstack([plan.green_s, np.asarray(plan.ahead_s)])
 

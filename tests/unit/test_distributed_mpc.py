@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import cycle
+from pathlib import Path
 from typing import Any
 
 import daqp
@@ -12,8 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
+from tests.integration import odd_nets
 from utn_controllers.mpc.agent import Agent
+from utn_controllers.mpc.central import CentralizedMPC
 from utn_controllers.mpc.distributed import DistributedMPC, Settings
 from utn_controllers.mpc.place import places, remaining_steps
 from utn_controllers.mpc.problem import JunctionProblem, QuadraticProgram, Timing
@@ -734,6 +739,51 @@ def test_a_controller_that_failed_plans_again_in_the_next_step(utn17: Network, s
     with pytest.raises(ControllerError):
         ask(mpc)
     assert_admissible(utn17, ask(mpc))
+
+
+def test_a_solver_that_refused_once_is_asked_again(utn17: Network, solver: type[Solver]) -> None:
+    mpc = DistributedMPC(utn17)
+    solver.setup_flag = -5
+    for _ in range(2):
+        with pytest.raises(ControllerError, match="refused"):
+            ask(mpc)
+    solver.setup_flag = None
+    assert_admissible(utn17, ask(mpc))
+
+
+@pytest.mark.parametrize("controller", [DistributedMPC, CentralizedMPC])
+def test_one_road_whose_turns_have_stages_of_their_own_is_planned_for(
+    street_of: Callable[[Callable[[Path], Path]], Network], controller: type[DistributedMPC | CentralizedMPC]
+) -> None:
+    network = street_of(odd_nets.one_road)
+    assert (len(network.links), len(network.turns), len(network.stages)) == (1, 2, 2)
+    rng = np.random.default_rng(1)
+    plan = controller(network).plan(random_state(network, rng), random_forecast(network, rng, HORIZON))
+    assert_admissible(network, plan)
+
+
+@pytest.mark.parametrize("settings", [{"horizon": 3.0}, {"rho": 1e300}, {"q": 1e300}, {"terminal": 1e9}])
+def test_a_setting_that_no_solver_can_work_with_is_refused_by_its_own_name(settings: dict[str, float]) -> None:
+    [name] = settings
+    with pytest.raises(ValidationError, match=rf"1 validation error.*\n{name}\n"):
+        Settings(**settings)  # type: ignore[arg-type]
+
+
+def test_no_more_is_expected_to_come_in_than_the_road_lets_in(utn17: Network) -> None:
+    source, other = utn17.links_of[3][:2]
+    links = [replace(link, entry_flow_veh_s=0.05) if at == source else link for at, link in enumerate(utn17.links)]
+    net, waiting = replace(utn17, links=tuple(links)), np.zeros(len(links))
+    waiting[[source, other]] = 60
+    state = replace(quiet_state(net), source_queue_veh=waiting)
+    agent_of = {}
+    for name, each in (("free", utn17), ("narrow", net)):
+        mpc = DistributedMPC(each)
+        mpc.plan(state, Forecast(np.tile(net.is_source * 20.0, (HORIZON, 1))))
+        agent = mpc.agents[3]
+        agent_of[name] = agent.solution[agent.problem.layout.inflow]
+    most_veh = 0.05 * net.control_step_s
+    assert agent_of["narrow"][:, 0].max() <= most_veh + 1e-6
+    assert agent_of["free"][:, 0].max() > 5 * most_veh
 
 
 def test_the_way_that_is_left_shrinks_by_a_link_at_every_turn(any_net: Network) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -149,6 +150,40 @@ def test_a_pool_of_processes_plans_alike_and_outlives_a_state_that_is_no_number(
     again = random_state(utn17, rng)
     budget = pool.plan(again, forecast).green_s @ (utn17.stage_junction[:, None] == np.arange(8))
     assert budget == pytest.approx(utn17.green_budget_s, abs=1e-3)
+
+
+def test_when_a_process_has_died_every_plan_says_so_and_no_answer_is_left_over(utn17: Network) -> None:
+    mpc = DistributedMPC(utn17, agents="processes", workers=2)
+    crew, rng = mpc.crew, np.random.default_rng(1)
+    assert isinstance(crew, Processes)
+    crew.workers[1].kill()
+    crew.workers[1].join()
+    for _ in range(3):
+        with pytest.raises(ControllerError, match="a process of the agents has ended"):
+            mpc.plan(random_state(utn17, rng), random_forecast(utn17, rng, 7))
+    assert not crew.pipes[0].poll(0.2)
+
+
+@pytest.mark.parametrize("spoilt", [{"x_veh": np.nan}, {"past_inflow_veh": 1e20}])
+def test_after_a_failure_all_regions_begin_anew_together(utn17: Network, spoilt: dict[str, float]) -> None:
+    rng = np.random.default_rng(1)
+    state, again = random_state(utn17, rng), random_state(utn17, rng)
+    forecast = random_forecast(utn17, rng, 7)
+    # One region fails, and the others do not; or none in the first step, in which all tell each other what they expect.
+    last = (np.arange(len(utn17.links)) == len(utn17.links) - 1) | ("x_veh" not in spoilt)
+    bad = replace(state, **{name: np.where(last, value, getattr(state, name)) for name, value in spoilt.items()})
+    greens = []
+    for workers in (1, 3):
+        mpc = DistributedMPC(utn17, workers=workers)
+        with pytest.raises(ControllerError):
+            mpc.plan(bad, forecast)
+        mpc.plan(state, forecast)
+        with pytest.raises(ControllerError) if "x_veh" in spoilt else nullcontext():
+            mpc.plan(bad, forecast)
+        plan = mpc.plan(again, forecast)
+        assert plan.facts["converged"]
+        greens.append(plan.green_s)
+    assert greens[1] == pytest.approx(greens[0], abs=1e-4)
 
 
 def test_a_region_that_can_not_be_built_is_told_of_by_its_process() -> None:

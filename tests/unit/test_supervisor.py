@@ -23,18 +23,21 @@ class Scripted:
 
     def plan(self, state: State, forecast: Forecast) -> Plan:
         answer = self.answers.pop(0)
-        if isinstance(answer, Exception):
+        if isinstance(answer, BaseException):
             raise answer
         plan: Plan = answer
         return plan
 
 
-def asked(net: Network, *answers: Any) -> list[Decision]:
+def empty(net: Network) -> tuple[State, Forecast]:
     links, turns = np.zeros(len(net.links)), np.zeros(len(net.turns))
     past = np.zeros((net.delay_samples, len(net.links)))
-    state = State(0, 0.0, links, turns, links, past, turns, net.fraction, links)
+    return State(0, 0.0, links, turns, links, past, turns, net.fraction, links), Forecast(np.zeros((1, len(net.links))))
+
+
+def asked(net: Network, *answers: Any) -> list[Decision]:
     supervisor = Supervisor(net, Scripted(answers))
-    return [supervisor.ask(state, Forecast(links[None])) for _ in answers]
+    return [supervisor.ask(*empty(net)) for _ in answers]
 
 
 def greens(net: Network, first_s: float) -> Floats:
@@ -50,6 +53,7 @@ def good(net: Network) -> Plan:
 
 BROKEN: dict[str, tuple[Any, str]] = {
     "raises": (ValueError("no idea"), "ValueError: no idea"),
+    "is closed": (GeneratorExit(), "GeneratorExit"),
     "divides by zero": (ZeroDivisionError(), "ZeroDivisionError"),
     "returns not a number": (Plan(np.full(17, np.nan)), "not finite"),
     "returns too few": (Plan(np.full(16, 55.0)), "shape (16,)"),
@@ -127,6 +131,18 @@ def test_every_plan_that_is_given_out_is_safe(utn17: Network) -> None:
     answers = [good(utn17), *(answer for answer, _ in BROKEN.values()), good(utn17)]
     for decision in asked(utn17, *answers):
         signals.admit(decision.plan, utn17)
+
+
+def test_what_a_controller_writes_into_what_it_is_told_is_its_own_affair(utn17: Network) -> None:
+    class Scribbler(Scripted):
+        def plan(self, state: State, forecast: Forecast) -> Plan:
+            state.x_veh[:] = forecast.demand_veh[:] = np.nan
+            return super().plan(state, forecast)
+
+    state, forecast = empty(utn17)
+    assert Supervisor(utn17, Scribbler([good(utn17)])).ask(state, forecast).rung == "solved"
+    assert (state.x_veh == 0).all()
+    assert (forecast.demand_veh == 0).all()
 
 
 def test_ctrl_c_is_not_swallowed(utn17: Network) -> None:

@@ -62,6 +62,10 @@ class Agent:
         self.program = self.receding.programs(state, forecast).only
         self.load(rho)
 
+    def forget(self) -> None:
+        """Let the solver begin anew."""
+        self._solver = None
+
     def load(self, rho: float) -> None:
         """Hand the programme to the solver."""
         if self._solver is None or rho != self._rho:
@@ -76,14 +80,14 @@ class Agent:
         sense = np.zeros(len(program.upper), dtype=np.int32)
         sense[program.lower == program.upper] = EQUALITY
         sense[self._given] = EQUALITY
-        self._rho = rho
-        self._solver = self._new_solver()
-        self._solver.settings = {"cycle_tol": PATIENCE}
-        flag, _ = self._solver.setup(
+        solver = self._new_solver()
+        solver.settings = {"cycle_tol": PATIENCE}
+        flag, _ = solver.setup(
             program.hessian + rho * self._gram, program.gradient, program.matrix, program.upper, program.lower, sense
         )
         if flag < 0:
             raise ControllerError(f"agent {self.place.part.name}: the solver refused its problem (flag {flag})")
+        self._rho, self._solver = rho, solver
 
     def _program(self) -> QuadraticProgram:
         if self.program is None:

@@ -63,9 +63,13 @@ class Batch:
         """Numbers below the diagonal and on it, of the Hessians and of what rho adds to them."""
         self._programs: Programs | None = None
         self._scale = np.zeros(0)
+        self._unsolved = np.zeros(self._shape)
+        self.forget()
+
+    def forget(self) -> None:
+        """Let the solver begin anew."""
         length = self._size + self._rows
         self._x, self._z, self._y = (self._zeros(k) for k in (self._size, length, length))
-        self._unsolved = np.zeros(self._shape)
 
     def prepare(self, state: State, forecast: Forecast, rho: float) -> None:
         """Take up a new state; the solver goes on from the last one's answers."""

@@ -12,6 +12,7 @@ Nothing is decided here but when to stop and the penalty, from one sum of square
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from utn_controllers.mpc.interactions import Message
 from utn_controllers.mpc.region import SUMS
 from utn_controllers.mpc.settings import Settings
 from utn_sumo.contract import Floats, Forecast, State
+from utn_sumo.errors import ControllerError
 
 ADAPT_RATIO = 10.0
 """The penalty adapts while one residual is this many times the other, then it is frozen for good."""
@@ -46,15 +48,27 @@ class Coordinator:
     def __init__(self, crew: Crew, settings: Settings):
         self.crew = crew
         self.settings = settings
-        self._frozen = settings.coordination != "admm"
         self._rho = settings.first_rho
         self._numbers, self._told = (sum(each) for each in zip(*crew.call("size"), strict=True))
+        self._frozen = settings.coordination != "admm"
 
     def plan(self, states: list[State], forecasts: list[Forecast]) -> tuple[list[Floats], Outcome]:
         """Greens (Kc, S) by region, and how they were come by, from what concerns each region.
 
-        Raises ControllerError if an agent has no optimum.
+        Raises ControllerError if an agent has no optimum. What has been agreed by then is forgotten everywhere: some
+        regions may have gone on and others not, and numbers that no agent could bear must not come back.
         """
+        try:
+            return self._plan(states, forecasts)
+        except Exception:
+            self._frozen = self.settings.coordination != "admm"
+            self._rho = self.settings.first_rho
+            # Of a crew that has lost somebody this can't be had: what it says next is what has happened.
+            with suppress(ControllerError):
+                self.crew.call("forget")
+            raise
+
+    def _plan(self, states: list[State], forecasts: list[Forecast]) -> tuple[list[Floats], Outcome]:
         crew, settings = self.crew, self.settings
         crew.call("greet", self._deliver(crew.call("begin", states, forecasts)))
         primal = dual = np.inf

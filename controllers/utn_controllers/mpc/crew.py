@@ -9,12 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from threadpoolctl import threadpool_limits
 
 from utn_controllers.mpc.region import Region
 from utn_sumo.errors import ControllerError
+
+
+LOST = ControllerError("a process of the agents has ended: see what it printed")
 
 
 class Crew(Protocol):
@@ -45,35 +49,47 @@ class Processes:
 
     def __init__(self, regions: Sequence[Callable[[], Region]]):
         context = get_context("spawn")
-        self._pipes: list[Connection] = []
+        self.pipes: list[Connection] = []
+        self.workers: list[BaseProcess] = []
         for build in regions:
             here, there = context.Pipe()
             # Daemons end with this process, however it ends.
-            context.Process(target=_serve, args=(there, build), daemon=True).start()
-            self._pipes.append(here)
-        for failed in [_received(pipe) for pipe in self._pipes]:
+            self.workers.append(context.Process(target=_serve, args=(there, build), daemon=True))
+            self.workers[-1].start()
+            # Whoever else has it open does not hear that the other end is gone.
+            there.close()
+            self.pipes.append(here)
+        for failed in [_received(pipe) for pipe in self.pipes]:
             if failed is not None:
                 raise failed
 
     def __len__(self) -> int:
-        return len(self._pipes)
+        return len(self.pipes)
 
     def call(self, method: str, *arguments: Sequence[Any]) -> list[Any]:
-        for pipe, *own in zip(self._pipes, *arguments, strict=True):
-            pipe.send((method, own))
+        sent = [_sent(pipe, (method, own)) for pipe, *own in zip(self.pipes, *arguments, strict=True)]
         # All answers are fetched before any error is raised: none must be left for the next call.
-        answers = [_received(pipe) for pipe in self._pipes]
+        answers = [_received(pipe) if is_sent else LOST for pipe, is_sent in zip(self.pipes, sent, strict=True)]
         for answer in answers:
             if isinstance(answer, Exception):
                 raise answer
         return answers
 
 
+def _sent(pipe: Connection, item: Any) -> bool:
+    """Whether somebody is there to take it."""
+    try:
+        pipe.send(item)
+    except OSError:
+        return False
+    return True
+
+
 def _received(pipe: Connection) -> Any:
     try:
         return pipe.recv()
-    except EOFError:
-        return ControllerError("a process of the agents has ended: see what it printed")
+    except (EOFError, OSError):
+        return LOST
 
 
 def _serve(pipe: Connection, build: Callable[[], Region]) -> None:

@@ -14,7 +14,7 @@ from utn_controllers.mpc.problem import Timing
 from utn_controllers.mpc.region import Region
 from utn_controllers.mpc.settings import Settings
 from utn_controllers.mpc.statement import Structure
-from utn_sumo.contract import Forecast, Network, Plan, State
+from utn_sumo.contract import EXIT, Forecast, Network, Plan, State
 from utn_sumo.model import check_step
 
 if TYPE_CHECKING:
@@ -29,15 +29,26 @@ BATCH_FROM = 8
 
 
 def _alike(network: Network, junctions: list[int], settings: Settings) -> list[list[int]]:
-    """The junctions in groups of one structure where enough of them have it, else alone."""
+    """The junctions in groups of one structure where enough of them have it, else alone.
+
+    Alone are those too that share no flow with others: an exact answer ends what they have to say, while those of a
+    group come to be exact only in rounds, of which these would need as many for themselves.
+    """
     if settings.coordination != "admm":
         return [[junction] for junction in junctions]
     alike: dict[Structure, list[int]] = {}
-    for junction in junctions:
+    apart = [junction for junction in junctions if _is_apart(network, junction)]
+    for junction in sorted(set(junctions) - set(apart)):
         alike.setdefault(Structure.of(network.part(junction), settings), []).append(junction)
     large = [group for group in alike.values() if len(group) >= BATCH_FROM]
-    few = sorted(junction for group in alike.values() if len(group) < BATCH_FROM for junction in group)
-    return [[junction] for junction in few] + large
+    few = [junction for group in alike.values() if len(group) < BATCH_FROM for junction in group]
+    return [[junction] for junction in sorted([*few, *apart])] + large
+
+
+def _is_apart(network: Network, junction: int) -> bool:
+    """Whether nobody drives from it to another junction, or back to it, nor comes from one."""
+    links, turns = network.links_of[junction], network.turns_of[junction]
+    return bool(network.is_source[links].all() and (network.turn_next[turns] == EXIT).all())
 
 
 class DistributedMPC:

@@ -306,8 +306,10 @@ class JunctionProblem:
     def _simple_bounds(self) -> tuple[Floats, Floats]:
         shape = (self.count, self.layout.size)
         lower, upper = np.zeros(shape), np.full(shape, np.inf)
+        part, green = self.place.part, self.layout.green
+        entry_veh = np.where(part.is_source, part.entry_flow_veh_s * self.model.step_s, np.inf)
+        upper[:, self.layout.inflow] = entry_veh.reshape(self.count, 1, -1)
         if self.settings.constraints == "kept":
-            part, green = self.place.part, self.layout.green
             least = part.min_green_s.reshape(self.count, 1, -1)
             lower[:, green] = least
             # What the cycle leaves when every other stage has its least (SPEC 3).

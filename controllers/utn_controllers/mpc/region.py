@@ -67,6 +67,16 @@ class Region:
         self._memory = Memory(2 * self.target.size)
         self._fresh = True
 
+    def forget(self) -> None:
+        """Begin as on the first day: nothing is agreed, and no solver goes on from anything."""
+        self.rho = self.settings.first_rho if self.settings.coordination != "none" else 0.0
+        self._fresh = True
+        self._memory.clear()
+        for array in (self.target, self.price):
+            array[:] = 0.0
+        for agent in self.agents:
+            agent.forget()
+
     def begin(self, state: State, forecast: Forecast) -> dict[int, Message]:
         """Take up the state of its own links and turns, an agent's after the other's, of which each is told its own.
 

@@ -10,14 +10,18 @@ RHO = {"tts": 0.2, "paper": 0.6}
 """Penalties that need the fewest iterations, by cost, found on random states of `utn17`."""
 
 
+MOST = 1e6
+"""Of weights: with more a solver has no digits left for anything else."""
+
+
 class ProblemSettings(BaseModel):
     """What states the problem, whoever solves it; every field is checked when the controller is built."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
-    horizon: int = Field(7, ge=1, le=60)
+    horizon: int = Field(7, ge=1, le=60, strict=True)
     """Kp, control steps predicted."""
-    control_horizon: int = Field(4, ge=1, le=60)
+    control_horizon: int = Field(4, ge=1, le=60, strict=True)
     """Kc, control steps in which the greens may change, held after it; 4, or Kp where that is less."""
     step_s: float | None = Field(None, gt=0)
     """Step of the prediction's model; a divisor of the control step, by default all of it."""
@@ -28,13 +32,13 @@ class ProblemSettings(BaseModel):
     """The time that all vehicles spend, or the paper's quadratic cost."""
     constraints: Literal["kept", "dropped"] = "kept"
     """Whether greens must fill their cycles and keep their least, and links their storage; what dropping them costs."""
-    q: float = Field(0.1, ge=0)
+    q: float = Field(0.1, ge=0, le=MOST)
     """Q of the paper's cost: weight of x^2."""
-    r: float = Field(0.3, ge=0)
+    r: float = Field(0.3, ge=0, le=MOST)
     """R of the paper's cost: weight of g^2 (g in s)."""
-    crowding: float = Field(1.0, ge=0)
+    crowding: float = Field(1.0, ge=0, le=MOST)
     """Weight of x^2 / storage beside the time spent in the `tts` cost: what keeps room on the links."""
-    terminal: float = Field(1.0, ge=0)
+    terminal: float = Field(1.0, ge=0, le=MOST)
     """Weight of the time that the vehicles left at the horizon's end still need, in the `tts` cost."""
 
     @model_validator(mode="before")
@@ -96,7 +100,7 @@ class Settings(ProblemSettings):
     """Address of a Dask scheduler; without it the actors are processes of this machine."""
     iterations: int = Field(60, ge=1, le=1000)
     """Most iterations in a control step."""
-    rho: float | None = Field(None, gt=0)
+    rho: float | None = Field(None, gt=0, le=MOST)
     """First penalty; by default what suits the cost."""
     relaxation: float = Field(1.6, gt=0, lt=2)
     """How far an iteration goes beyond what the agents have agreed on."""
