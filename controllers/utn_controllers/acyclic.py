@@ -6,6 +6,10 @@ which nobody carries out.
 max_wave       the stage with most vehicles approaching (RESCO's MAXWAVE)
 max_pressure   the stage with most pressure: vehicles before it less those behind it (Varaiya 2013)
 priced         the stage that gains most by the vehicles that it can move within a short horizon, at prices of the links
+
+Whom a stage serves has way in it. Who gives way counts where no stage of the junction lets him go first: else whichever
+stage serves all, with left turns in the gaps of their opposites, would be worth as much as theirs, however long they
+wait.
 """
 
 from __future__ import annotations
@@ -16,7 +20,17 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.fixed_time import FixedTime
-from utn_sumo.contract import EXIT, Floats, Ints, Network, Plan, State, View
+from utn_sumo.clearances import HAS_WAY
+from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network, Plan, State, View
+
+
+def served(network: Network) -> Bools:
+    """(S, M) turns that count for each stage: those that have way in it, or never have and give way in it."""
+    has_way = np.zeros_like(network.serves)
+    for stage, shown in enumerate(network.stages):
+        letters = zip(shown.state, network.junctions[shown.junction].signal_turns, strict=True)
+        has_way[stage, [turn for letter, turns in letters if letter == HAS_WAY for turn in turns]] = True
+    return np.where(has_way.any(axis=0), has_way, network.serves)
 
 
 class Acyclic:
@@ -26,6 +40,7 @@ class Acyclic:
         self.network = network
         self.every_s = every_s
         self.fraction = network.fraction
+        self.serves = served(network)
         self._best = _Best(network)
 
     def begin(self, plan: Plan, state: State) -> None:  # noqa: ARG002 - it has no use for a plan
@@ -62,7 +77,7 @@ class _Best:
         most = np.maximum.reduceat(ordered, self._starts)
         at = np.where(ordered >= np.repeat(most, self._counts), np.arange(len(ordered)), len(ordered))
         first = self._order[np.minimum.reduceat(at, self._starts)]
-        return np.where((worth[present] >= most) & (most > 0), present, first)
+        return np.where(worth[present] >= most, present, first)
 
 
 class WaveSettings(BaseModel):
@@ -83,7 +98,7 @@ class Wave(Acyclic):
         super().__init__(network, WaveSettings(**settings).every_s)
 
     def worth(self, view: View) -> Floats:
-        return np.asarray(self.network.serves @ self.by_turn(view.near_veh))
+        return np.asarray(self.serves @ self.by_turn(view.near_veh))
 
 
 class PressureSettings(WaveSettings):
@@ -110,17 +125,18 @@ class Pressure(Acyclic):
             by_link = np.bincount(network.group_link, lanes, len(network.links))
             room = network.storage_veh[network.group_link] * lanes / by_link[network.group_link]
         self._room = room
-        self._fed = (network.turn_next != EXIT).astype(float)
         self._next = np.maximum(network.turn_next, 0)
+        # What stands between the nodes of one signal is before its own stages: it holds up nobody that it does not free.
+        own = network.link_junction[self._next] == network.link_junction[network.turn_link]
+        self._fed = (network.turn_next != EXIT) & ~own
 
     def worth(self, view: View) -> Floats:
         net = self.network
         veh = view.near_veh if self._near else view.waiting_veh
-        before = self.by_turn(veh / self._room)
-        by_link = np.bincount(net.group_link, veh / self._room, len(net.links))
-        behind = self._fed * by_link[self._next] * self.fraction
+        before = (veh / self._room)[net.turn_group]
+        behind = np.bincount(net.turn_link, self.fraction * before, len(net.links))[self._next] * self._fed
         flow = self.by_turn(net.group_saturation_flow_veh_s)
-        return np.asarray(net.serves @ (flow * (before - behind)))
+        return np.asarray(self.serves @ (flow * (before - behind)))
 
 
 class PricedSettings(WaveSettings):
@@ -151,7 +167,7 @@ class Prices(Acyclic):
         super().__init__(network, self.settings.every_s)
         self._fed = network.turn_next != EXIT
         self._next = np.maximum(network.turn_next, 0)
-        self._stage, self._turn = np.nonzero(network.serves)
+        self._stage, self._turn = np.nonzero(self.serves)
 
     def worth(self, view: View) -> Floats:
         net, settings = self.network, self.settings

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 from xml.etree import ElementTree as ET  # only to write
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -34,11 +34,22 @@ class Peer(BaseModel, ABC):
         """The programmes of its junctions, and the network with the cycles that they have. Raises UtnError."""
 
 
-class Actuated(Peer):
-    """SUMO's actuated signals: a green ends when nobody has passed its detectors for a while."""
+class Responsive(Peer):
+    """A peer that ends greens itself."""
 
     max_green_s: int = Field(50, ge=1, le=3600)
     """Netconvert's `tls.max-dur`."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min_green_s > self.max_green_s:
+            raise ValueError(f"min_green_s is {self.min_green_s}, over max_green_s {self.max_green_s}: make it less")
+        return self
+
+
+class Actuated(Responsive):
+    """SUMO's actuated signals: a green ends when nobody has passed its detectors for a while."""
+
     max_gap_s: float = Field(3.0, ge=0, le=60)
     """Time without a vehicle that ends a green: SUMO's default."""
     detector_gap_s: float = Field(2.0, ge=0, le=60)
@@ -49,11 +60,9 @@ class Actuated(Peer):
         return network, _responsive(network, "actuated", chosen.begin_s, self.max_green_s, gaps)
 
 
-class DelayBased(Peer):
+class DelayBased(Responsive):
     """SUMO's delay_based signals: a green goes on while vehicles that have lost time come nearer."""
 
-    max_green_s: int = Field(50, ge=1, le=3600)
-    """Netconvert's `tls.max-dur`."""
     detector_range_m: float = Field(100.0, gt=0, le=10_000)
     """How far upstream vehicles are seen: SUMO's default."""
     min_time_loss_s: float = Field(1.0, ge=0, le=3600)
@@ -133,7 +142,9 @@ def _responsive(
         for name, value in parameters.items():
             ET.SubElement(logic, "param", key=name, value=f"{value:g}")
         for stage in (network.stages[index] for index in junction.stages):
-            least, most = (in_digits(green_s) for green_s in (stage.min_green_s, max(stage.min_green_s, max_green_s)))
+            # A plan's least green is no more than the net's own programme shows; `minDur` may be more.
+            least_s = max(stage.min_green_s, stage.least_green_s)
+            least, most = (in_digits(green_s) for green_s in (least_s, max(least_s, max_green_s)))
             ET.SubElement(logic, "phase", duration=least, minDur=least, maxDur=most, state=stage.state)
             for state, seconds in stage.clearance:
                 ET.SubElement(logic, "phase", duration=in_digits(seconds), state=state)

@@ -7,6 +7,7 @@ greens and offsets: clearances stay the net's. Both know every vehicle that is g
 
 from __future__ import annotations
 
+import re
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -113,7 +114,11 @@ def _busiest_hour(chosen: Case, routes: Path, headway_s: float) -> tuple[float, 
 
 
 def _write_net(source: Path, network: Network, green_s: Floats, target: Path) -> None:
-    """Write a net with programmes of the network's stages under these greens (S,), and one for each other signal."""
+    """Write a net with programmes of the network's stages under these greens (S,), and one for each other signal.
+
+    For the tools whatever shows a green and no yellow is a stage: in clearances, where vehicles go on while who walks
+    is cleared, it is yellow for them.
+    """
     with opened(source) as file:
         root = ET.parse(file).getroot()
     logics = root.findall("tlLogic")
@@ -122,6 +127,13 @@ def _write_net(source: Path, network: Network, green_s: Floats, target: Path) ->
     for logic in logics:
         root.remove(logic)
     own = {logic.attrib["id"]: logic for logic in fixed(network, green_s, 0.0)}
+    for junction in network.junctions:
+        phases = own[junction.id].iter("phase")
+        for stage in junction.stages:
+            next(phases)
+            for _ in network.stages[stage].clearance:
+                cleared = next(phases)
+                cleared.set("state", re.sub("[Gg]", "y", cleared.attrib["state"]))
     for logic in (others | own).values():
         root.insert(place, logic)
     ET.ElementTree(root).write(target, encoding="utf-8")

@@ -57,9 +57,13 @@ class Block:
     clearance: tuple[Phase, ...]
 
     def min_green_s(self, usual_s: float) -> float:
-        """Least green of the stage: what the net says, else the usual one, but no more than the net itself shows."""
-        wished_s = usual_s if self.stage.least_s is None else self.stage.least_s
-        return float(math.ceil(max(1.0, min(wished_s, self.stage.duration_s))))
+        """Least green of a plan: what the net says, else the usual one, but no more than the net itself shows."""
+        return float(math.ceil(min(self.least_green_s(usual_s), max(1.0, self.stage.duration_s))))
+
+    def least_green_s(self, usual_s: float) -> float:
+        """Least green where greens end early: what the net says, else the usual one, if the net shows as much."""
+        wished_s = min(usual_s, self.stage.duration_s) if self.stage.least_s is None else self.stage.least_s
+        return float(math.ceil(max(1.0, wished_s)))
 
 
 @dataclass(frozen=True)

@@ -371,7 +371,7 @@ def _stage(block: Block, junction: int, signal_turns: Sequence[Sequence[int]], u
         turns=served(block.stage),
         min_green_s=block.min_green_s(usual_green_s),
         # Who walks has five seconds to set out, and the clearance to arrive; a walk with no vehicles beside it lasts.
-        least_green_s=block.min_green_s(SHORT_GREEN_S if served(block.stage) else usual_green_s),
+        least_green_s=block.least_green_s(SHORT_GREEN_S if served(block.stage) else usual_green_s),
         held=tuple(served(phase) for phase in block.clearance),
     )
 
