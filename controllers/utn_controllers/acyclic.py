@@ -126,7 +126,7 @@ class Pressure(Acyclic):
             room = network.storage_veh[network.group_link] * lanes / by_link[network.group_link]
         self._room = room
         self._next = np.maximum(network.turn_next, 0)
-        # What stands between the nodes of one signal is before its own stages: it holds up nobody that it does not free.
+        # Who stands between the nodes of one signal is before its own stages: none of them is worth less for that.
         own = network.link_junction[self._next] == network.link_junction[network.turn_link]
         self._fed = (network.turn_next != EXIT) & ~own
 

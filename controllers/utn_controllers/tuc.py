@@ -102,10 +102,11 @@ def store_and_forward(network: Network) -> Floats:
 def regulator(moved: Floats, weight: Floats, r: float) -> Floats:
     """(S, n) L of u = -L x, by which the sum of x' diag(weight) x + r |u|^2 is least, x(k+1) = x(k) + `moved` u(k).
 
-    Fewer greens are free than there are numbers in x, so that part of x stays as it is whatever they are: an integrator out of
-    reach, with which the Riccati equation has no stabilising solution. The singular vectors of the scaled model part
-    what is in reach from what is not, and as the state is the identity they leave a scalar equation of each mode:
-    p = p + 1 - (size p)^2 / (r + size^2 p), gain = size p / (r + size^2 p). What is out of reach has gain 0.
+    Fewer greens are free than there are numbers in x, so that part of x stays as it is whatever they are: an
+    integrator out of reach, with which the Riccati equation has no stabilising solution. The singular vectors of the
+    scaled model part what is in reach from what is not, and as the state is the identity they leave a scalar equation
+    of each mode: p = p + 1 - (size p)^2 / (r + size^2 p), gain = size p / (r + size^2 p). What is out of reach has a
+    gain of 0.
     """
     scale = np.sqrt(weight)
     mode_x, size, mode_u = np.linalg.svd(scale[:, None] * moved, full_matrices=False)

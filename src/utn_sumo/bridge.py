@@ -83,7 +83,7 @@ def run(
     # Of other people's vehicles some start amid links, and nobody says how many.
     disturbance_veh = scenario.disturbance * scenario.demand * step_s / 3600 if chosen is None else UNKNOWN_VEH
     estimator = Estimator(net, known, scenario.loop_error, disturbance_veh)
-    miscount = Miscount(net, scenario.loop_error, scenario.seed)
+    miscount, horizon = Miscount(net, scenario.loop_error, scenario.seed), controller.horizon
     supervisor = Supervisor(net, controller)
     tally = _Tally()
     interrupted = False
@@ -97,7 +97,6 @@ def run(
         # SUMO's own start is in its own time; what follows is its time, the controller's, or the bridge's.
         started, start_s = time.perf_counter(), plant.sumo_time_s
         recorder, state = recording.Recorder(folder, _settings(scenario, driving, plant.version)), estimator.initial()
-        horizon = controller.horizon
         try:
             for step in range(steps):
                 ahead = predictor.forecast(horizon)

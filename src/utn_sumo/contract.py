@@ -132,7 +132,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Caller:
-    """Who has letters of a signal and is no motor traffic: people, bicycles, trams. He says himself that he is there."""
+    """Who has letters of a signal and is no motor traffic: people, bicycles, trams. They call for green themselves."""
 
     letter: int
     buttons: tuple[tuple[str, str], ...] = ()

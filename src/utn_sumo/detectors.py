@@ -207,8 +207,8 @@ def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, f
                 yield kind, f"{edge}_{lane}", from_m, to_m
     for via in (via for lanes in _amid(network) for via in lanes if within_step):
         yield "amid", via, 0.0, NEARLY_M
-    for lane in sorted({lane for _, caller in network.callers for lane in caller.lanes}) if within_step else ():
-        yield "call", lane, -CALLING_M, NEARLY_M
+    for own in sorted({own for _, caller in network.callers for own in caller.lanes}) if within_step else ():
+        yield "call", own, -CALLING_M, NEARLY_M
 
 
 def write(network: Network, path: Path, period_s: float, *, within_step: bool = False) -> None:

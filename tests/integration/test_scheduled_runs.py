@@ -235,6 +235,26 @@ def test_bicycles_on_a_lane_of_their_own_are_served_though_hardly_a_car_calls(
     assert max(waits_s(tmp_path / "out", "bike")) < 200
 
 
+def test_people_call_for_green_and_nobody_is_stopped_for_nobody(tmp_path: Path) -> None:
+    flows = (("W", "E", 7), ("E", "W", 7), ("nC", "sC", 900))
+    cars = "".join(odd_nets.flow(f"{a}{b}", f"{a}-C", f"C-{b}", period=period, end=1200) for a, b, period in flows)
+    person = '<person id="p" depart="400"><walk from="nC-C" to="C-sC" arrivalPos="20"/></person>'
+    shown = []
+    for name, people in (("nobody", ""), ("somebody", person)):
+        (tmp_path / name).mkdir()
+        odd_nets.row("C").net(tmp_path / name, odd_nets.NO_TURNAROUNDS, "--sidewalks.guess", "--crossings.guess")
+        file = odd_nets.case(tmp_path / name, cars + people, end="1200")
+        result = bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / name / "out")
+        assert_safe(result)
+        greens = monitor.read_switches(tmp_path / name / "out" / "signals.xml")["C"]
+        shown.append(sum(then[0] in "Gg" and state[0] not in "Gg" for (_, state), (_, then) in pairwise(greens)))
+        walks = list(ET.parse(tmp_path / name / "out" / "trips.xml").getroot().iter("walk"))
+        assert all(float(walk.attrib["timeLoss"]) < 90 for walk in walks)
+        assert len(walks) == (name == "somebody")
+    # For the two cars that come on the quiet road, and for whoever walks.
+    assert shown == [2, 3]
+
+
 @pytest.mark.parametrize("vclass", ["bicycle", "motorcycle", "moped"])
 def test_vehicles_shorter_than_cars_are_seen_at_the_line(vclass: str, tmp_path: Path) -> None:
     odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)

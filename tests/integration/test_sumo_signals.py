@@ -20,6 +20,8 @@ from utn_sumo.scenario import scenario
 from utn_sumo.sumo_signals import PEERS
 from utn_sumo.sumo_tools import sumo_binary
 
+from . import odd_nets
+
 SCENARIOS = Path(__file__).parents[3] / "shared" / "scenarios"
 Run = Callable[..., tuple[dict[str, Any], Path]]
 
@@ -120,6 +122,13 @@ def test_their_settings_reach_sumo(
     assert result["unsafe_signal_s"] == 0
 
 
+@pytest.mark.parametrize("controller", ["actuated", "delay_based"])
+def test_greens_whose_least_is_over_their_most_are_refused(controller: str, tmp_path: Path) -> None:
+    bounds = {"min_green_s": 30, "max_green_s": 20}
+    line = complaint(SettingError, tmp_path, controller=controller, settings=bounds)
+    assert "min_green_s is 30, over max_green_s 20: make it less" in line
+
+
 def test_no_green_is_over_its_most(utn17: Network, run_of: Run) -> None:
     _, folder = run_of(controller="actuated", hours=0.5, demand=1.3, settings={"max_green_s": 20})
     assert max(map(max, greens_s(utn17, folder).values())) == 20
@@ -152,6 +161,32 @@ def test_webster_gives_busy_junctions_longer_cycles_within_its_bounds(run_of: Ru
     assert sum(cycles_s(heavy).values()) > sum(cycles_s(light).values()) + 40
     _, bounded = run_of(controller="webster", hours=0.5, demand=0.4, settings={"min_cycle_s": 90})
     assert min(cycles_s(bounded).values()) >= 85
+
+
+def test_the_bounds_of_webster_s_cycles_hold_where_cars_go_on_while_who_walks_is_cleared(tmp_path: Path) -> None:
+    file = odd_nets.pedestrians(tmp_path)
+    for least_s, most_s in ((50, 120), (90, 120)):
+        folder, bounds = tmp_path / str(least_s), {"min_cycle_s": least_s, "max_cycle_s": most_s}
+        result = bridge.run(scenario(net=str(file), controller="webster", settings=bounds), folder)
+        assert result["unsafe_signal_s"] == 0
+        assert min(cycles_s(folder).values()) >= least_s - 5
+
+
+@pytest.mark.parametrize("controller", ["actuated", "delay_based"])
+def test_a_least_green_that_the_net_names_is_kept_though_its_programme_shows_less(
+    controller: str, tmp_path: Path
+) -> None:
+    file = odd_nets.case(tmp_path, odd_nets.traffic("C", period=60))
+    net = odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    logic = odd_nets.tl_logic("C", odd_nets.TWO_STAGES)
+    for phase in logic:
+        if "G" in phase.attrib["state"]:
+            phase.attrib.update(duration="6", minDur="11")
+    odd_nets.retime(net, logic)
+    result = bridge.run(scenario(net=str(file), controller=controller), tmp_path / "run")
+    assert result["unsafe_signal_s"] == 0
+    switches = list(pairwise(monitor.read_switches(tmp_path / "run" / "signals.xml")["C"]))[1:]
+    assert min(end - start for (start, state), (end, _) in switches if "G" in state) == 11
 
 
 def test_coordinated_junctions_have_one_cycle_and_offsets_of_their_own(run_of: Run) -> None:

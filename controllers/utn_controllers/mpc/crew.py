@@ -17,7 +17,6 @@ from threadpoolctl import threadpool_limits
 from utn_controllers.mpc.region import Region
 from utn_sumo.errors import ControllerError
 
-
 LOST = ControllerError("a process of the agents has ended: see what it printed")
 
 

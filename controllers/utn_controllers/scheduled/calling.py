@@ -62,7 +62,7 @@ class Calling:
         """
         if not len(self._called):
             return stand, come, worth, ends, most
-        pressed = np.bincount(self._stream, calling, len(self._called))
+        pressed = np.bincount(self._stream, calling, len(self._called)).astype(np.float64)
         left = PRESSED_VEH * staying[self._junction]
         return (
             self._mixed(stand, pressed),

@@ -39,7 +39,7 @@ class Giving:
     """Keeps which share of each lane set waits for gaps."""
 
     def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, most: int):
-        """But for the lane sets whose discharge in a stage is `learnt` (S, L); junctions have `most` streams or fewer."""
+        """But for lane sets whose discharge in a stage is `learnt` (S, L). No junction has more than `most` streams."""
         self._streams = streams
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
         """(S, V) signalled ways that wait for gaps in a stage."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -143,6 +144,12 @@ class Crossing:
     """Walking areas at its ends, SUMO's edges."""
 
 
+def _letters(connection: Any) -> tuple[int, ...]:
+    """Those that a connection onto a crossing names."""
+    names = [connection.get(name) for name in ("linkIndex", "linkIndex2")]
+    return tuple(int(name) for name in names if name and int(name) >= 0)
+
+
 def crossings(path: Path) -> dict[str, list[Crossing]]:
     """Pedestrian crossings by their signal."""
     from defusedxml import ElementTree  # noqa: PLC0415
@@ -153,7 +160,7 @@ def crossings(path: Path) -> dict[str, list[Crossing]]:
     inside: dict[str, tuple[str, int]] = {}
     letters: dict[tuple[str, str], tuple[int, ...]] = {}
     edges: dict[str, frozenset[str]] = {}
-    areas: dict[str, set[str]] = {}
+    beside: dict[str, set[str]] = defaultdict(set)
     with opened(path) as file:
         for _, element in ElementTree.iterparse(file, forbid_dtd=True):
             if element.tag == "junction" and element.get("type") != "internal":
@@ -164,19 +171,16 @@ def crossings(path: Path) -> dict[str, list[Crossing]]:
             elif element.tag == "connection":
                 start, end = element.get("from"), element.get("to") or ""
                 if element.get("tl") and end.startswith(":"):
-                    names = [element.get(name) for name in ("linkIndex", "linkIndex2")]
-                    used = tuple(int(name) for name in names if name and int(name) >= 0)
-                    letters.setdefault((element.get("tl"), end), used)
-                for crossing, area in ((end, start), (start, end)):
-                    if crossing in edges:
-                        areas.setdefault(crossing, set()).add(area)
+                    letters.setdefault((element.get("tl"), end), _letters(element))
+                beside[end].add(start)
+                beside[start].add(end)
             if element.tag in ("junction", "connection", "edge", "tlLogic"):
                 element.clear()
     found: dict[str, list[Crossing]] = {}
     for (signal, edge), used in letters.items():
         if f"{edge}_0" in inside:
             node, request = inside[f"{edge}_0"]
-            ends = tuple(sorted(areas.get(edge, ())))
+            ends = tuple(sorted(beside[edge]))
             crossing = Crossing(node, request, used, edges.get(edge, frozenset()), edge, ends)
             found.setdefault(signal, []).append(crossing)
     return found

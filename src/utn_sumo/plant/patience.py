@@ -83,8 +83,8 @@ class Patience:
 
     def _look(self, view: View) -> None:
         waits, troubled = _look(
-            view.time_s, view.stage, view.set_waiting_veh, view.calling, self._way_set, self._needs, self._served, self._junction,
-            self._carefree_s, self._stood_s, self._since_s,
+            view.time_s, view.stage, view.set_waiting_veh, view.calling, self._way_set, self._needs, self._served,
+            self._junction, self._carefree_s, self._stood_s, self._since_s,
         )  # fmt: skip
         self._next = {
             junction: self._first(
@@ -97,8 +97,8 @@ class Patience:
         """Have the machine code made now, not at the first look."""
         stage = np.array([junction.stages[0] for junction in network.junctions], dtype=np.int64)
         _look(
-            0.0, stage, np.zeros(len(network.lane_sets)), np.zeros(len(network.callers)), self._way_set, self._needs, self._served, self._junction,
-            self._carefree_s, self._stood_s.copy(), self._since_s.copy(),
+            0.0, stage, np.zeros(len(network.lane_sets)), np.zeros(len(network.callers)), self._way_set, self._needs,
+            self._served, self._junction, self._carefree_s, self._stood_s.copy(), self._since_s.copy(),
         )  # fmt: skip
 
     def _first(self, present: int, waiting: Ints, now_s: float) -> tuple[int, float]:
