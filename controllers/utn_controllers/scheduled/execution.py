@@ -127,6 +127,7 @@ class Scheduled:
         stand, come, held = outlook.look(view, zones, parked_veh)
         stuck = self._standstill.look(view, present, stand)
         self._yielding.look(view, view.free, present, zones[0])
+        self._giving.look(view, view.free, present, zones[0])
         worth, most = self._worth.look(
             view.time_s, view.free, zones, view.x_veh, outlook.shares, self._most, stuck, held
         )

@@ -13,11 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from utn_controllers.scheduled.standstill import Shown
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY, HAS_WAY
 from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
+START_S, MEMORY_S = 3.0, 10.0
+"""From a green's begin until it is seen who goes, and over how much green it is taken."""
+ALL = 0.95
+"""Who discharges at so much of what he can has a queue."""
 GAP_S = 4.0
 """How long there must be nobody: what drivers take, and SUMO's."""
 
@@ -31,6 +36,10 @@ class Gaps(NamedTuple):
     """(S, most streams of a junction, most foes + 1) streams of the junction in whose gaps it goes, then -1."""
     some: Bools
     """(S,) whether anybody waits for gaps."""
+    beside: Bools
+    """(S, most streams of a junction) whether there are lanes beside its own that move in another way."""
+    flowing: Floats
+    """(S, most streams of a junction) share of its discharge that its lanes have in the stage that is shown."""
     per_veh: float
     """By what power of e fewer go for each vehicle in a bin that comes towards them."""
 
@@ -56,13 +65,40 @@ class Giving:
                     foes.setdefault((row, int(streams.lane_set[stream])), set()).update(own)
         shape, most_foes = (len(streams.stage), most), max((len(own) for own in foes.values()), default=0)
         self.gaps = Gaps(
-            np.zeros(shape), np.full((*shape, most_foes + 1), -1), np.zeros(shape[0], dtype=np.bool_), GAP_S / bin_s
+            waiting=np.zeros(shape),
+            foes=np.full((*shape, most_foes + 1), -1),
+            some=np.zeros(shape[0], dtype=np.bool_),
+            beside=np.zeros(shape, dtype=np.bool_),
+            flowing=np.ones(shape),
+            per_veh=GAP_S / bin_s,
         )
+        sets_of_link = np.bincount(network.set_link, minlength=len(network.links))
         for row, stage in enumerate(streams.stage):
             first, last = streams.first[network.stage_junction[stage] :][:2]
             for stream in first + np.flatnonzero(streams.serves[row, first:last]):
                 found = sorted(foes.get((row, int(streams.lane_set[stream])), ()))
                 self.gaps.foes[row, stream - first, : len(found)] = np.array(found, dtype=np.int64) - first
+                self.gaps.beside[row, stream - first] = sets_of_link[streams.link[stream]] > 1
+        self._network = network
+        self._flowing = np.ones(len(network.lane_sets))
+        """(L,) share of its discharge that each lane set has had of late in the green that it has."""
+        self._queued = np.zeros(len(network.lane_sets), dtype=np.bool_)
+        """(L,) lane sets that had somebody by the stop line when they were last looked at."""
+        self._looked_s = np.zeros(len(network.junctions))
+        """(J,) when that was."""
+        self._left_veh = np.zeros(len(network.lane_sets))
+        """(L,) who had left by then."""
+        self._is_needed = bool(foes)
+
+    def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats) -> None:
+        """Take up how fast those go who have green before the junctions `asked` (J,); as Yielding.look."""
+        if self._is_needed:
+            network, streams = self._network, self._streams
+            _see(
+                view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0],
+                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._flowing,
+                self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.first, self.gaps.flowing,
+            )  # fmt: skip
 
     def take_up(self, of_set: Floats) -> None:
         """Go by these shares (V,) that signalled ways have of their lane sets' traffic from now on."""
@@ -92,14 +128,39 @@ def _foes(network: Network, streams: Streams, row: int, stage: int, way: int) ->
 
 
 @compiled
+def _see(
+    time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, flow: Floats,
+    set_junction: Ints, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats, stream_set: Ints,
+    first: Ints, shown: Floats,
+) -> None:  # fmt: skip
+    for lane_set, junction in enumerate(set_junction):
+        if not asked[junction]:
+            continue
+        since_s = time_s - looked_s[junction]
+        if not queued[lane_set] or looked_s[junction] < begin_s[junction] + START_S:
+            flowing[lane_set] = 1.0
+        else:
+            gone = min((left[lane_set] - before[lane_set]) / (flow[lane_set] * since_s), 1.0)
+            flowing[lane_set] += min(since_s / MEMORY_S, 1.0) * (gone - flowing[lane_set])
+        queued[lane_set] = near[lane_set] >= 1
+        before[lane_set] = left[lane_set]
+    for junction in range(len(asked)):
+        if asked[junction]:
+            looked_s[junction] = time_s
+            for stream in range(first[junction], first[junction + 1]):
+                shown[present[junction], stream - first[junction]] = flowing[stream_set[stream]]
+
+
+@compiled
 def let_go(
     row: int, bin_: int, veh: Floats, come: Floats, most: Floats, moves: Floats, going: Ints, gaps: Gaps,
-    pace: Floats, want: Floats,
+    pace: Floats, free: Floats, want: Floats,
 ) -> None:  # fmt: skip
     """Brings the vehicles `veh` (n,) of those who have green in a stage, the `row`, up to the end of a bin.
 
     `pace` (n,) is which share of their discharge those have who wait for gaps, kept from bin to bin of a green: 1
-    before its first; `want` (n,) is room for who would go.
+    before its first; `free` (n,) which share of their lanes has nobody in front who waits for one, with others beside
+    them: every vehicle that goes brings somebody there. `want` (n,) is room for who would go.
     """
     place = 0
     while going[row, place] >= 0:
@@ -111,12 +172,21 @@ def let_go(
     while going[row, place] >= 0:
         stream = going[row, place]
         if gaps.waiting[row, stream] > 0:
-            towards, foe = 0.0, 0
+            towards, foe, share, beside = 0.0, 0, gaps.waiting[row, stream], gaps.beside[row, stream]
             while gaps.foes[row, stream, foe] >= 0:
-                towards += want[gaps.foes[row, stream, foe]]
+                other = gaps.foes[row, stream, foe]
+                towards += want[other]
+                # Between those of a queue there is no room, however few a bin they are.
+                if beside and gaps.waiting[row, other] == 0 and want[other] >= ALL * moves[row, other] * most[other]:
+                    towards = np.inf
                 foe += 1
-            pace[stream] = min(np.exp(-gaps.per_veh * towards) / gaps.waiting[row, stream], 1.0)
-            veh[stream] = max(veh[stream] - moves[row, stream] * most[stream] * pace[stream], 0.0)
+            found = min(np.exp(-gaps.per_veh * towards) / share, 1.0)
+            pace[stream] = free[stream] + (1 - free[stream]) * found if beside else found
+            goes = moves[row, stream] * pace[stream]
+            if most[stream] > 0:
+                # In a bin about one leaves each lane that discharges.
+                free[stream] *= (1 - share) ** (min(veh[stream] / most[stream], goes))
+            veh[stream] = max(veh[stream] - goes * most[stream], 0.0)
         else:
             veh[stream] -= want[stream]
         place += 1

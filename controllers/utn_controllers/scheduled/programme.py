@@ -142,7 +142,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
     after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     others, veh = np.empty(stages, np.int64), np.empty(streams)
-    pace, want = np.ones(streams), np.zeros(streams)
+    pace, free, want = np.ones(streams), np.ones(streams), np.zeros(streams)
     stood, left = np.empty((2, stages + 1))
     for begin in range(bins):
         for stage in range(stages):
@@ -165,7 +165,9 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     lose = 0 if clearing[row, other] >= 0 else min(lose, clearance[row, other])
             may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
             now, goes = begin, True
-            pace[:] = 1.0
+            pace[:], free[:] = 1.0, 1.0
+            if gaps is not None and begin == 0:
+                free[:] = gaps.flowing[row, :streams]
             while now < bins:
                 if spent + _held(stage, grown, paid, now, min(now + lose, bins), held) >= best - ALIKE:
                     break
@@ -234,7 +236,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                         veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
                         moving += worth[stream] * veh[stream]
                 else:
-                    let_go(row, now, veh, come, most, moves, going, gaps, pace, want)
+                    let_go(row, now, veh, come, most, moves, going, gaps, pace, free, want)
                     for place in range(greens):
                         moving += worth[going[row, place]] * veh[going[row, place]]
                 now += 1
@@ -420,11 +422,13 @@ def _send_off(
 @compiled
 def _let_all_go(plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats, most: Floats, sent: Floats) -> None:
     """Fills `sent` (n, K) as `_send_off` where somebody waits for gaps: bin by bin, from the vehicles `veh` (n,) on."""
-    pace, want = np.ones(len(veh)), np.zeros(len(veh))
+    pace, free, want = np.ones(len(veh)), np.ones(len(veh)), np.zeros(len(veh))
     for place, row in enumerate(plan):
-        if place == 0 or plan[place - 1] != row:
-            pace[:] = 1.0
         green = 0 <= row < len(gaps.some)
+        if place == 0 or plan[place - 1] != row:
+            pace[:], free[:] = 1.0, 1.0
+            if place == 0 and green:
+                free[:] = gaps.flowing[row, : len(veh)]
         for stream in range(len(veh)):
             share = rules.moves[row, stream] if row >= 0 else 0.0
             there = veh[stream] + come[stream, place]
@@ -432,6 +436,6 @@ def _let_all_go(plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats,
             if not (green and share > 0):
                 veh[stream] = max(there - share * most[stream], 0.0)
         if green:
-            let_go(row, place, veh, come, most, rules.moves, rules.going, gaps, pace, want)
+            let_go(row, place, veh, come, most, rules.moves, rules.going, gaps, pace, free, want)
         for stream in range(len(veh)):
             sent[stream, place] -= veh[stream]
