@@ -76,6 +76,16 @@ def test_without_structure_the_profile_is_not_beaten_by_guesswork() -> None:
     assert rmse("arima", counts, profile) <= 1.02 * usual
 
 
+@pytest.mark.parametrize("usual_veh", [0.2, 0.5, 1.0, 5.0])
+@pytest.mark.parametrize("method", ["starima", "arima"])
+def test_without_structure_the_forecast_is_the_profile_however_low_it_is(method: str, usual_veh: float) -> None:
+    counts = np.random.default_rng(1).poisson(usual_veh, (SERVING, 8)).astype(float)
+    predictor = SeriesPredictor(method, 8, profile=np.full((1, 8), usual_veh), weights=mean_of_others(8))
+    for row in counts:
+        predictor.observe(row)
+    assert predictor.forecast(HORIZON).ahead.tolist() == [[usual_veh] * 8] * HORIZON
+
+
 @pytest.mark.parametrize("method", ["starima", "arima"])
 def test_the_profile_serves_until_a_model_does(method: str) -> None:
     counts, profile = correlated(SERVING + 1, 4, 1, noise=0.8)

@@ -240,8 +240,11 @@ class SeriesPredictor:
         if self._profile is None:
             return row
         usual = _rows_from(self._profile, step, 1)[0]
+        if self._signed:
+            return row - usual
         # In proportion, so that busy and quiet hours are of one kind.
-        return row - usual if self._signed else np.asarray(row / np.maximum(usual, LEAST_PROFILE_VEH) - 1.0)
+        scale = np.maximum(usual, LEAST_PROFILE_VEH)
+        return np.asarray(row / scale - usual / scale)
 
     def _from_departure(self, departure: Floats, series: int, step: int) -> Floats:
         """The way back for one series, (horizon,) from `step` on."""
@@ -250,7 +253,8 @@ class SeriesPredictor:
         usual = _rows_from(self._profile, step, len(departure))[:, series]
         if self._signed:
             return np.asarray(usual + departure)
-        return np.asarray(np.maximum(usual, LEAST_PROFILE_VEH) * np.maximum(1.0 + departure, 0.0))
+        scale = np.maximum(usual, LEAST_PROFILE_VEH)
+        return np.asarray(scale * np.maximum(usual / scale + departure, 0.0))
 
 
 class _Model:
