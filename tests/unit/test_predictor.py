@@ -86,6 +86,20 @@ def test_without_structure_the_forecast_is_the_profile_however_low_it_is(method:
     assert predictor.forecast(HORIZON).ahead.tolist() == [[usual_veh] * 8] * HORIZON
 
 
+@pytest.mark.parametrize(("seed", "steps"), [(1, 90), (49, 50)])
+def test_a_search_that_ends_at_a_unit_root_has_found_nothing(seed: int, steps: int) -> None:
+    chance = np.random.default_rng(seed).poisson(5.0, (steps, 8)) / 5.0 - 1.0
+    job = Job(chance.tolist(), [list(range(8))], [matrix.tolist() for matrix in mean_of_others(8)], centred=True)
+    assert [found.params for found in fitting.fit(job)] == [None]
+
+
+def test_a_search_that_takes_long_is_waited_for() -> None:
+    counts, profile = correlated(125, 6, 0, noise=0.2)
+    departure = (counts / profile - 1.0)[:90, :1]
+    found = fitting.fit(Job(departure.tolist(), [[0]], [], centred=True))
+    assert found[0].order == (1, 0, 1)
+
+
 @pytest.mark.parametrize("method", ["starima", "arima"])
 def test_the_profile_serves_until_a_model_does(method: str) -> None:
     counts, profile = correlated(SERVING + 1, 4, 1, noise=0.8)

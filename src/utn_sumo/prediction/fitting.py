@@ -27,6 +27,10 @@ ORDERS = (((1, 0, 1), (0, 0)), ((1, 0, 1), (1, 1)))
 
 A level that is correlated in time and counted at random is an ARMA(1, 1).
 """
+MOST_ITERATIONS = 300
+"""Of a fit: where coefficients nearly cancel each other it is slow, and what ends before its maximum is not used."""
+LARGEST_ROOT = 0.999
+"""Of a fit that is used: nearer to 1 rounding makes of its likelihood whatever it likes."""
 FAILURES = (ValueError, ArithmeticError, np.linalg.LinAlgError, UtnError)
 """What a fit may end in on numbers that no model suits."""
 
@@ -159,8 +163,12 @@ def _best(rows: Floats, series: list[int], weights: Sequence[Floats], *, centred
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                results = model(rows, order, spatial, weights, centred=centred).fit(method="conditional")
+                fitted = model(rows, order, spatial, weights, centred=centred)
+                results = fitted.fit(method="conditional", maxiter=MOST_ITERATIONS)
         except FAILURES:
+            continue
+        root = max(fitted.form.ar_root(results.params), fitted.form.ma_root(results.params))
+        if root >= LARGEST_ROOT or not results.mle_retvals["converged"]:
             continue
         criterion = -2 * results.llf + len(results.params) * np.log(known)
         if criterion < least:
