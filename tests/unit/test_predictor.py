@@ -119,6 +119,37 @@ def test_without_a_profile_what_was_known_last_serves_and_before_that_nothing() 
     assert found.ahead.tolist() == [[4.0, 0.0], [4.0, 0.0]]
 
 
+@pytest.mark.parametrize("has_profile", [True, False])
+def test_a_series_that_never_varies_costs_the_others_nothing(has_profile: bool) -> None:
+    counts, profile = correlated(SERVING + 5, 4, 1, noise=0.8)
+    empty = np.zeros((len(counts), 1))
+    without = SeriesPredictor("starima", 4, profile=profile if has_profile else None, weights=mean_of_others(4))
+    beside = SeriesPredictor(
+        "starima", 5, profile=np.hstack([profile, empty]) if has_profile else None, weights=mean_of_others(5)
+    )
+    for row in counts:
+        without.observe(row)
+        beside.observe(np.append(row, 0.0))
+    found = beside.forecast(3)
+    assert found.methods == ["starima"] * 4 + ["profile" if has_profile else "last"]
+    assert found.ahead[:, :4] == pytest.approx(without.forecast(3).ahead)
+    assert not found.ahead[:, 4].any()
+
+
+@pytest.mark.parametrize(("has_profile", "serves"), [(True, "profile"), (False, "mean")])
+@pytest.mark.parametrize("method", ["starima", "arima"])
+def test_where_no_structure_was_found_no_model_is_said_to_serve(method: str, has_profile: bool, serves: str) -> None:
+    counts = np.random.default_rng(2).poisson(18.0, (SERVING, 3)).astype(float)
+    profile = np.full((1, 3), 18.0) if has_profile else None
+    predictor = SeriesPredictor(method, 3, profile=profile, weights=mean_of_others(3))
+    for row in counts:
+        predictor.observe(row)
+    found = predictor.forecast(2)
+    assert found.methods == [serves] * 3
+    expected = [18.0] * 3 if has_profile else counts[:LEAST_ROWS].mean(axis=0)
+    assert found.ahead == pytest.approx(np.tile(expected, (2, 1)))
+
+
 def test_a_detector_that_dies_is_served_by_the_profile_and_misleads_nobody() -> None:
     counts, profile = correlated(160, 4, 5)
     broken = counts.copy()

@@ -146,7 +146,9 @@ def model(
 
 
 def _best(rows: Floats, series: list[int], weights: Sequence[Floats], *, centred: bool) -> Fit | None:
-    series = [each for each in series if np.count_nonzero(~np.isnan(rows[:, each])) >= LEAST_KNOWN]
+    heard = [each for each in series if np.count_nonzero(~np.isnan(rows[:, each])) >= LEAST_KNOWN]
+    # A series that never varies has no structure, and STARIMA would refuse the others with it.
+    series = [each for each in heard if np.nanmin(rows[:, each]) < np.nanmax(rows[:, each])]
     if not series:
         return None
     rows, weights = rows[:, series], [matrix[np.ix_(series, series)] for matrix in weights]
@@ -154,8 +156,6 @@ def _best(rows: Floats, series: list[int], weights: Sequence[Floats], *, centred
     mean = np.zeros(len(series)) if centred else np.nanmean(rows, axis=0)
     best = Fit(series, mean.tolist())
     variance = float(np.nanmean((rows - mean) ** 2))
-    if variance <= 0:
-        return best
     least = known * (np.log(2 * np.pi * variance) + 1) + (1 if centred else 1 + len(series)) * np.log(known)
     for order, spatial in ORDERS:
         if max(spatial) > (len(weights) if len(series) > 1 else 0):

@@ -7,6 +7,7 @@ from none. Where a method can't serve a series, a plainer one does, and the fore
 `arima`     each from its own past: the same without space
 `profile`   the historical profile; where there is none, what was known last
 `last`      what was known last
+`mean`      the mean of what was known, where there is no structure and no profile: no method to ask for
 `perfect`   what will really come
 """
 
@@ -196,10 +197,11 @@ class SeriesPredictor:
         dead = self._dead
         for model in self._models:
             departures = model.forecast(horizon)
+            serves = self.method if model.has_structure else "profile" if self._centred else "mean"
             for column, series in enumerate(model.series):
                 if np.isfinite(departures[:, column]).all() and not dead[series]:
                     found.ahead[:, series] = self._from_departure(departures[:, column], series, step)
-                    found.methods[series] = self.method
+                    found.methods[series] = serves
         return found
 
     def _plain(self, step: int, horizon: int) -> Served:
@@ -241,7 +243,7 @@ class SeriesPredictor:
             return row
         usual = _rows_from(self._profile, step, 1)[0]
         if self._signed:
-            return row - usual
+            return np.asarray(row - usual)
         # In proportion, so that busy and quiet hours are of one kind.
         scale = np.maximum(usual, LEAST_PROFILE_VEH)
         return np.asarray(row / scale - usual / scale)
@@ -271,6 +273,11 @@ class _Model:
                 warnings.simplefilter("ignore")
                 fitted = fitting.model(rows[:, found.series], found.order, found.spatial, own, centred=centred)
                 self._results = fitted.filter(np.array(found.params))
+
+    @property
+    def has_structure(self) -> bool:
+        """Whether it says more than the mean."""
+        return self._results is not None
 
     def update(self, row: Floats) -> None:
         """Take up one more row (n,) of all series."""
