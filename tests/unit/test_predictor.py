@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -226,6 +228,18 @@ def test_a_fitter_that_dies_costs_its_fits_and_nothing_else() -> None:
         predictor.observe(row)
     assert predictor.forecast(2).methods == ["profile"] * 3
     doer.close()
+
+
+def test_nobody_waits_where_jobs_and_answers_are_longer_than_a_pipe_holds() -> None:
+    rows = np.random.default_rng(0).normal(5.0, 2.0, (15, 4000))
+    job = Job(rows.tolist(), [list(range(4000))], [], centred=False)
+    with closing(Background()) as doer:
+        submitting = Thread(target=lambda: [doer.submit(job) for _ in range(3)])
+        submitting.start()
+        submitting.join(1.0)
+        assert not submitting.is_alive()
+        for _ in range(3):
+            assert doer.result()[0].mean == pytest.approx(rows.mean(axis=0))
 
 
 def test_a_fit_that_fails_leaves_the_last_models_in_use(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,8 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, Protocol
 
 import numpy as np
@@ -90,7 +92,10 @@ class Here:
 
 
 class Background:
-    """Has the jobs done by a process of its own, which starts at once: statsmodels alone takes it seconds to import."""
+    """Has the jobs done by a process of its own, which starts at once: statsmodels alone takes it seconds to import.
+
+    A thread hands them over one by one and takes the answers: pipes hold little, and whoever writes waits.
+    """
 
     def __init__(self) -> None:
         # In a session of its own Ctrl-C does not reach it; it ends with its input.
@@ -102,25 +107,36 @@ class Background:
             text=True,
             start_new_session=True,
         )
+        self._jobs: SimpleQueue[Job | None] = SimpleQueue()
+        self._answers: SimpleQueue[str] = SimpleQueue()
+        # A daemon, so that who forgets to close it can end all the same.
+        self._thread = Thread(target=self._hand_over, daemon=True)
+        self._thread.start()
 
     def submit(self, job: Job) -> None:
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(json.dumps(asdict(job)) + "\n")
-            self._process.stdin.flush()
-        except (BrokenPipeError, ValueError):  # it has died; `result` says so
-            return
+        self._jobs.put(job)
 
     def result(self) -> list[Fit]:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
+        line = self._answers.get()
         return [Fit(**each) for each in json.loads(line)] if line else []
 
     def close(self) -> None:
+        self._process.kill()
+        self._jobs.put(None)
+        self._thread.join()
+        self._process.wait()
+
+    def _hand_over(self) -> None:
+        """Answer each job, with an empty line if the process has died."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.kill()
-        self._process.wait()
+        while (job := self._jobs.get()) is not None:
+            line = ""
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.write(json.dumps(asdict(job)) + "\n")
+                self._process.stdin.flush()
+                line = self._process.stdout.readline()
+            self._answers.put(line)
         self._process.stdout.close()
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
