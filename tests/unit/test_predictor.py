@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
+from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 from threadpoolctl import threadpool_limits
 
 from utn_sumo import demand
@@ -255,6 +256,25 @@ def test_a_fit_that_fails_leaves_the_last_models_in_use(monkeypatch: pytest.Monk
     for row in counts[SERVING + 2 :]:
         predictor.observe(row)
     assert predictor.forecast(2).methods == ["starima"] * 3
+
+
+def test_a_fit_comes_into_use_with_one_pass_of_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    passes = []
+    one_pass = KalmanFilter._filter
+
+    def counted(self: Any, *args: Any, **kwargs: Any) -> Any:
+        passes.append(self.nobs)
+        return one_pass(self, *args, **kwargs)
+
+    counts, profile = correlated(SERVING, 4, 1, noise=0.8)
+    predictor = SeriesPredictor("starima", 4, profile=profile, weights=mean_of_others(4))
+    for row in counts[:-1]:
+        predictor.observe(row)
+    found = predictor._fitter.result()
+    monkeypatch.setattr(KalmanFilter, "_filter", counted)
+    predictor._adopt(found)
+    assert passes == [SERVING - 1]
+    assert predictor.forecast(1).methods == ["starima"] * 4
 
 
 def test_a_network_s_forecast_says_who_served_each_source(utn17: Network) -> None:

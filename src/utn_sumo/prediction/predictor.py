@@ -272,7 +272,8 @@ class _Model:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 fitted = fitting.model(rows[:, found.series], found.order, found.spatial, own, centred=centred)
-                self._results = fitted.filter(np.array(found.params))
+                # Standard errors would take two passes of the filter for each parameter, and nobody asks for them.
+                self._results = fitted.filter(np.array(found.params), cov_type="none")
 
     @property
     def has_structure(self) -> bool:
