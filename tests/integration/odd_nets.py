@@ -209,6 +209,12 @@ def plain(folder: Path) -> Path:
     return case(folder, traffic("C"))
 
 
+def two_lanes(folder: Path) -> Path:
+    """Two lanes a road, left turns in the gaps of their opposites from the inner one."""
+    row("C", lanes=2).net(folder, NO_TURNAROUNDS)
+    return case(folder, traffic("C"))
+
+
 # Who is on the road
 
 

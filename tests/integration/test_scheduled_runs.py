@@ -235,6 +235,25 @@ def test_bicycles_on_a_lane_of_their_own_are_served_though_hardly_a_car_calls(
     assert max(waits_s(tmp_path / "out", "bike")) < 200
 
 
+def test_a_lane_that_stands_behind_a_left_turn_does_not_keep_the_main_road_s_green(tmp_path: Path) -> None:
+    odd_nets.row("C", lanes=2).net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    ways = {"W": ("E", "nC", "sC"), "E": ("W", "sC", "nC"), "nC": ("sC", "E", "W"), "sC": ("nC", "W", "E")}
+    # Of the main road 15 % turn left, from the inner of its two lanes.
+    flows = "".join(
+        f'<flow id="{arm}{end}" begin="0" end="2400" period="exp({rate / 3600:.6f})" departLane="best" '
+        f'departSpeed="max" from="{arm}-C" to="C-{end}"/>'
+        for arm, ends in ways.items()
+        for end, rate in zip(ends, (805, 172, 172) if arm in "WE" else (175, 38, 38), strict=True)
+    )
+    file = odd_nets.case(tmp_path, flows, end="2400")
+    results = {
+        controller: bridge.run(scenario(net=str(file), controller=controller, seed=5), tmp_path / controller)
+        for controller in ("actuated", "recommended")
+    }
+    assert_safe(results["recommended"])
+    assert results["recommended"]["mean_delay_s"] < 0.95 * results["actuated"]["mean_delay_s"]
+
+
 def test_people_call_for_green_and_nobody_is_stopped_for_nobody(tmp_path: Path) -> None:
     flows = (("W", "E", 7), ("E", "W", 7), ("nC", "sC", 900))
     cars = "".join(odd_nets.flow(f"{a}{b}", f"{a}-C", f"C-{b}", period=period, end=1200) for a, b, period in flows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.integration import odd_nets
+from tests.unit.views import by_the_line, scene
 from utn_controllers.scheduled.execution import Scheduled
-from utn_controllers.scheduled.gaps import Gaps, let_go
+from utn_controllers.scheduled.gaps import Gaps, Giving, let_go
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.contract import Network
@@ -24,14 +26,26 @@ StreetOf = Callable[[Make], Network]
 BINS = 12
 
 
-def queues(waiting: float, towards_veh: float, come_veh: float = 0.0) -> list[float]:
-    """What is left in each bin of a green of ten vehicles that give way to a queue and to who comes towards them."""
-    gaps = Gaps(np.array([[waiting, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.array([True]), 2.0)
+def queues(
+    waiting: float, towards_veh: float, come_veh: float = 0.0, *, beside: bool = False, flowing: float = 1.0
+) -> list[float]:
+    """What is left in each bin of a green of ten vehicles that give way to a queue and to who comes towards them.
+
+    Whether there are lanes `beside` theirs, of which the share `flowing` has nobody who waits in front.
+    """
+    gaps = Gaps(
+        np.array([[waiting, 0.0]]),
+        np.array([[[1, -1], [-1, -1]]]),
+        np.array([True]),
+        np.array([[beside, False]]),
+        np.ones((1, 2)),
+        2.0,
+    )
     veh, come = np.array([10.0, towards_veh]), np.zeros((2, BINS))
     come[1] = come_veh
-    pace, want, left = np.ones(2), np.zeros(2), []
+    pace, free, want, left = np.ones(2), np.array([flowing, 1.0]), np.zeros(2), []
     for bin_ in range(BINS):
-        let_go(0, bin_, veh, come, np.ones(2), np.ones((1, 2)), np.array([[0, 1, -1]]), gaps, pace, want)
+        let_go(0, bin_, veh, come, np.ones(2), np.ones((1, 2)), np.array([[0, 1, -1]]), gaps, pace, free, want)
         left.append(float(veh[0]))
     return left
 
@@ -44,6 +58,25 @@ def test_hardly_anybody_goes_until_the_queue_towards_him_has() -> None:
     left = -np.diff([10.0, *queues(1.0, 6.0)])
     assert (left[:6] < 0.2).all()
     assert (left[6:] > 0.9).all()
+
+
+def test_a_lane_with_others_beside_it_goes_until_one_who_finds_no_gap_comes_to_its_front() -> None:
+    share = 0.2
+    left = -np.diff([10.0, *queues(share, 12.0, beside=True)])
+    # The first goes for sure, each after him if nobody before him waits there.
+    assert left[:3] == pytest.approx([1.0, 1 - share, (1 - share) ** (2 - share)])
+    assert (np.diff(left) < 0).all()
+
+
+def test_where_such_a_lane_stands_nobody_goes_as_long_as_there_is_a_queue_towards_it() -> None:
+    for share in (0.05, 0.5, 1.0):
+        left = -np.diff([10.0, *queues(share, 6.0, beside=True, flowing=0.0)])
+        assert left[:6] == pytest.approx(np.zeros(6))
+        assert left[-1] == pytest.approx(1.0)
+
+
+def test_lanes_without_others_beside_them_go_on_average_however_they_have_gone() -> None:
+    assert queues(0.2, 6.0, flowing=0.0) == queues(0.2, 6.0)
 
 
 @given(come=st.floats(0.0, 1.0), more=st.floats(0.01, 0.5), share=st.floats(0.1, 0.9))
@@ -69,6 +102,30 @@ def test_left_turns_without_a_stage_of_their_own_wait_for_who_comes_straight_on(
                 foes = gaps.foes[row, stream - first]
                 assert all(streams.link[first + foe] != streams.link[stream] for foe in foes[foes >= 0])
     assert gaps.some.any()
+
+
+def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(street_of: StreetOf) -> None:
+    network = street_of(odd_nets.two_lanes)
+    streams, stages = Streams(network), network.junctions[0].stages
+    giving = Giving(
+        network, streams, np.zeros((len(stages), len(network.lane_sets)), dtype=bool), 2.0, len(streams.link)
+    )
+    giving.take_up(streams.shares(network.fraction).way_of_set)
+    rows, everywhere = np.argsort(streams.stage), np.ones(1, dtype=bool)
+    waiting, seen = by_the_line(np.full(len(network.lane_sets), 5.0)), []
+    stands = int(streams.lane_set[np.flatnonzero(giving.gaps.waiting[rows[stages[0]]] > 0)[0]])
+    left = np.zeros(len(network.lane_sets))
+    for time_s in np.arange(0.0, 42.0, 2.0):
+        stage, begin_s = (stages[0], 0.0) if time_s < 30 else (stages[1], 30.0)
+        left += np.where(np.arange(len(left)) == stands, 0.0, 2.0)
+        now = replace(scene(network, float(time_s), np.array([stage])), begin_s=np.array([begin_s]), left_veh=left)
+        giving.look(now, everywhere, rows[now.stage], waiting)
+        shown = giving.gaps.flowing[rows[stage], : len(streams.link)]
+        assert (shown[streams.lane_set != stands] == 1).all()
+        seen.append(float(shown[streams.lane_set == stands][0]))
+    assert seen[:3] == [1.0, 1.0, 1.0]
+    assert seen[14] < 0.1
+    assert seen[16:18] == [1.0, 1.0]
 
 
 def test_lanes_part_where_somebody_gives_way_and_else_not() -> None:

@@ -86,7 +86,14 @@ class Crossing:
         first = np.array([0, stages])
         who = going(moves, stages, clearing, clearance)
         shape = stages, moves.shape[1]
-        gaps = Gaps(np.zeros(shape), np.full((*shape, 1), -1), np.zeros(stages, dtype=np.bool_), 2.0)
+        gaps = Gaps(
+            np.zeros(shape),
+            np.full((*shape, 1), -1),
+            np.zeros(stages, dtype=np.bool_),
+            np.zeros(shape, dtype=np.bool_),
+            np.ones(shape),
+            2.0,
+        )
         return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least), gaps)
 
     def decide(
