@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -24,7 +25,21 @@ ABOUT_OUTPUT = frozenset({"output", "report", "gui_only"})
 """Sections of a configuration that say what SUMO writes and shows."""
 SHOWN = frozenset({"log", "error-log", "message-log", "no-step-log", "no-warnings", "verbose", "gui-settings-file"})
 SHOWN |= {"duration-log.disable", "duration-log.statistics", "print-options", "aggregate-warnings"}
-"""Options that say so wherever they stand, as all with `output` in their names do: SUMO does not look at sections."""
+SHOWN |= {"human-readable-time", "precision"}
+"""Options that say so wherever they stand: SUMO does not look at sections."""
+WRITTEN = re.compile(
+    r".*output|(netstate|ndump|summary|tripinfo|vehroutes?|save-\w+)\b"
+    r"|device\.((ssm|toc)\.file|tripinfo\.(explicit|deterministic))$|pedestrian\.jupedsim\.(wkt|py)$"
+)
+"""Options that have SUMO write files, by older names too, or write of some vehicles alone."""
+NOWHERE = "NUL"
+"""The file that SUMO writes nothing to."""
+LEFT = frozenset({"max-depart-delay", "remote-port", "num-clients"})
+"""Options that no run has: who waits long to enter goes on waiting, since a controller that keeps more vehicles out
+would look better without them, and nobody else's programme steers SUMO."""
+RECORDED = "device.tripinfo.probability"
+"""Option by which trips are left off the record: every trip is on it. SUMO still draws a number for each vehicle where
+it is said, so that who has other devices stays the same."""
 SEEDS = frozenset({"seed", "random"})
 OURS = frozenset({"net-file", "route-files", "additional-files", "begin", "end", *SEEDS})
 """Options that other fields of a `Case` stand for."""
@@ -32,7 +47,8 @@ FILES = ("weight-files", "load-state")
 """Further options that name files to read."""
 LONG = {"n": "net-file", "r": "route-files", "a": "additional-files", "b": "begin", "e": "end", "w": "weight-files"}
 LONG |= {"net": "net-file", "routes": "route-files", "additional": "additional-files", "weights": "weight-files"}
-LONG |= {"W": "no-warnings", "v": "verbose", "l": "log", "p": "print-options"}
+LONG |= {"W": "no-warnings", "v": "verbose", "l": "log", "p": "print-options", "C": "save-configuration"}
+LONG |= {"H": "human-readable-time"}
 """SUMO's short and older names of options."""
 UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 
@@ -119,6 +135,8 @@ class Case:
             words += ["--additional-files", _joined(files)]
         if self.end_s is not None:
             words += ["--end", in_digits(self.end_s)]
+        # The device writes a file for each vehicle that has it, even where nobody names one.
+        words += ["--device.ssm.file", NOWHERE]
         return [*words, *(word for name, value in self.options for word in (f"--{name}", value))]
 
 
@@ -128,8 +146,9 @@ def read(path: Path) -> Case:
     for section in elements(path, "scenario", "give a .sumocfg"):
         for option in [section, *section]:
             name, value = LONG.get(option.tag, option.tag), option.get("value", option.get("v"))
-            if value is not None and not (section.tag in ABOUT_OUTPUT or name in SHOWN or "output" in name):
-                said[name] = value
+            if value is None or section.tag in ABOUT_OUTPUT or name in SHOWN | LEFT or WRITTEN.match(name):
+                continue
+            said[name] = "1" if name == RECORDED else value
     if "net-file" not in said:
         raise SettingError(f"scenario {str(path)!r} names no net-file: give a whole .sumocfg")
     found = {name: _files(path, name, said.get(name, "")) for name in ("net-file", "route-files", "additional-files")}

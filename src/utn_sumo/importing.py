@@ -1,7 +1,7 @@
 """Somebody else's scenario as a folder of its own: complete, with all that the bench knows of it, for anybody to run.
 
 scenario.sumocfg        window, step, teleport and every other option, by names that hold wherever the folder lies
-the input files         unchanged, but for the files that they name, and those that they want written: these go nowhere
+the input files         unchanged, but for the files that they name, and what they want written, or left off the record
 NET.turns.xml           turning fractions, as the routes have them, or the ways that SUMO finds
 NET.calibration.json    the model's parameters, where they have been fitted
 detectors.add.xml       our detectors: no part of the scenario, since every run brings its own
@@ -113,7 +113,7 @@ class _Copies:
         self.names: dict[Path, str] = {}
         """Of each original its copy."""
         self._taken = {SCENARIO, DETECTORS, MODEL, MAP}
-        self.net = self.of(net_file)
+        self.net = self.mended(net_file)
         self._taken |= {_beside(Path(self.net), ending).name for ending in (TURNS, FITTED)}
 
     def of(self, path: Path) -> str:

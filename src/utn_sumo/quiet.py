@@ -1,14 +1,15 @@
-"""Input files of a scenario that have SUMO write others: what they would write goes nowhere."""
+"""Input files of a scenario that have SUMO write others, which go nowhere, or leave trips off the record."""
 
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from utn_sumo.case import Case
+from utn_sumo.case import NOWHERE, Case
 from utn_sumo.xml_files import opened
 
 WRITES = {"timedEvent": "dest", "calibrator": "output"} | dict.fromkeys(
@@ -19,9 +20,14 @@ WRITES = {"timedEvent": "dest", "calibrator": "output"} | dict.fromkeys(
     "file",
 )
 """Elements of additional files that have SUMO write a file, and the attribute that names it."""
-SIGNS = (b"<include", b"file=", b"dest=", b"output=")
-"""What a file holds that names other files."""
-NOWHERE = "NUL"
+PARAMETERS = dict.fromkeys(("file", "device.ssm.file", "device.toc.file"), NOWHERE)
+"""Keys of parameters that have signals and devices write a file, and what they are to say."""
+PARAMETERS |= {"has.tripinfo.device": "true", "device.tripinfo.probability": "1"}
+"""Those by which a vehicle's trip may be on no record."""
+SIGNS = re.compile(
+    rb"<include|(?<![\w.-])(file|dest|output)\s*(=|$)|[\"'](%b)[\"']" % "|".join(map(re.escape, PARAMETERS)).encode()
+)
+"""What a file holds that names other files, or one of these."""
 
 
 def parsed(path: Path) -> Any | None:
@@ -29,14 +35,15 @@ def parsed(path: Path) -> Any | None:
     from defusedxml import ElementTree  # noqa: PLC0415
 
     with opened(path) as file:
-        if not any(word in line for line in file for word in SIGNS):
+        if not any(map(SIGNS.search, file)):
             return None
     with opened(path) as file:
         return ElementTree.parse(file, forbid_dtd=True)
 
 
 def mend(tree: Any, original: Path, *, included: Callable[[Path], str], read: Callable[[Path], str]) -> bool:
-    """Turn what a tree writes to nowhere, and name what it includes and reads anew; whether it had to be changed.
+    """Turn what a tree writes to nowhere, put every trip on record, and name what it includes and reads anew; whether
+    it had to be changed.
 
     `included` and `read` give the new name of a file that lies where the `original` has it.
     """
@@ -46,6 +53,9 @@ def mend(tree: Any, original: Path, *, included: Callable[[Path], str], read: Ca
         names = "href" if element.tag == "include" else "file"
         if written in element.attrib:
             element.set(written, NOWHERE)
+            changed = True
+        elif element.tag == "param" and element.get("key") in PARAMETERS:
+            element.set("value", PARAMETERS[element.get("key")])
             changed = True
         elif (original.parent / element.get(names, "")).is_file():
             inside = original.parent / element.get(names)
@@ -61,7 +71,7 @@ def write(tree: Any, target: Path) -> None:
 
 
 def silenced(chosen: Case, folder: Path) -> Case:
-    """The case with copies in `folder` of those of its files that would have SUMO write something."""
+    """The case with copies in `folder` of those of its files that say what SUMO is to write."""
     copies: dict[Path, Path] = {}
 
     def copied(path: Path) -> Path:
@@ -79,6 +89,7 @@ def silenced(chosen: Case, folder: Path) -> Case:
 
     return replace(
         chosen,
+        net_file=copied(chosen.net_file),
         route_files=tuple(map(copied, chosen.route_files)),
         additional_files=tuple(map(copied, chosen.additional_files)),
     )
