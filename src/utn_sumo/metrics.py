@@ -32,7 +32,8 @@ def trip_measures(trips: Path) -> dict[str, Any]:
             spent += wait_s + road_s
             delay += wait_s + float(trip.attrib["timeLoss"])
             stops += int(trip.attrib["waitingCount"])
-            if float(trip.attrib["arrival"]) >= 0:
+            # Whom SUMO takes off the road for good has an arrival too, but never got to where he wanted.
+            if float(trip.attrib["arrival"]) >= 0 and not trip.get("vaporized"):
                 arrived += 1
                 travel += wait_s + road_s
             trip.clear()

@@ -77,6 +77,18 @@ def test_who_has_other_devices_stays_the_same(crossroads: Path) -> None:
     assert bare.items() <= ours.items()
 
 
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_who_is_taken_off_the_road_has_not_arrived(crossroads: Path, tmp_path: Path, controller: str) -> None:
+    broken = '<trip id="broken" depart="0" from="W-C" to="C-E"><stop lane="W-C_0" endPos="150" duration="900"/></trip>'
+    behind = odd_nets.flow("behind", "W-C", "C-E", begin=1, end=100)
+    options = {"time-to-teleport": "20", "time-to-teleport.remove": "true"}
+    result = ran(odd_nets.case(crossroads, broken + behind, options=options), tmp_path / "run", controller)
+    assert result["teleports"] > 3
+    assert (result["arrived"], vehicles(result)) == (0, 8)
+    assert result["mean_travel_time_s"] == 0
+    assert result["total_delay_veh_h"] > 0
+
+
 # name: (options, what a type says, additional file)
 ASKED: dict[str, tuple[dict[str, str], str, str]] = {
     "states of the net": ({"netstate-dump": "mine.xml", "netstate-dump.precision": "3"}, "", ""),
