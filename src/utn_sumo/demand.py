@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -18,7 +19,7 @@ import numpy as np
 from defusedxml import ElementTree
 
 from utn_sumo.contract import EXIT, Floats, Network
-from utn_sumo.errors import SettingError
+from utn_sumo.errors import NetworkError, SettingError
 
 LOW_VEH_H, HIGH_VEH_H = 300.0, 800.0
 PAPER_MEAN_VEH_H, PAPER_SD_VEH_H = 550.0, 125.0
@@ -85,7 +86,7 @@ def route_file(
     `disturbance_veh_h` start amid each link, for each hour and unit of `scale`.
 
     The cache is `$UTN_CACHE`, else `~/.cache/utn-sumo`. A file is written aside and moved into place, so that
-    runs side by side never see half of one.
+    runs side by side never see half of one. Raises NetworkError if a trip might never come to an end.
     """
     key = repr(
         (FORMAT, profile, duration_s, step_s, scale, noise, seed, disturbance_veh_h, network.turns, network.links)
@@ -95,6 +96,7 @@ def route_file(
     path = folder / f"{network.name}-{profile}-{scale:g}-seed{seed}-{digest}.rou.xml"
     if path.is_file():
         return path
+    _check_ways_out(network, everywhere=disturbance_veh_h > 0)
     steps = int(np.ceil(duration_s / step_s))
     rates = drawn_rates_veh_h(network, profile, steps, scale=scale, noise=noise, seed=seed)
     trips = _trips(network, rates, step_s, duration_s, seed)
@@ -166,6 +168,33 @@ def _trips_amid(network: Network, rate_veh_h: float, duration_s: float, seed: in
             for depart_s in departures
         ]
     return trips
+
+
+def _check_ways_out(network: Network, *, everywhere: bool) -> None:
+    """Raise NetworkError if trips from the sources, or from `everywhere`, come to a link that no way leads out from."""
+    onto: dict[int, list[int]] = {}
+    into: dict[int, list[int]] = {}
+    for turn in network.turns:
+        if turn.fraction > 0:
+            onto.setdefault(turn.link, []).append(turn.next_link)
+            into.setdefault(turn.next_link, []).append(turn.link)
+    first = range(len(network.links)) if everywhere else np.flatnonzero(network.is_source).tolist()
+    leads_out = _reached(into, [EXIT])
+    for link in sorted(_reached(onto, first) - leads_out):
+        raise NetworkError(
+            f"link {network.links[link].id!r} leads nowhere out of net {network.name!r}, by its turning fractions and "
+            "those after it: give a turn that leaves the net a fraction above 0"
+        )
+
+
+def _reached(ways: Mapping[int, list[int]], first: Iterable[int]) -> set[int]:
+    """Where the ways lead from the first places, these among them."""
+    found, todo = set(first), list(first)
+    while todo:
+        further = set(ways.get(todo.pop(), ())) - found
+        found |= further
+        todo += further
+    return found
 
 
 def onward(network: Network, link: int, rng: np.random.Generator) -> list[str]:

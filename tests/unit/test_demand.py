@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 
 from utn_sumo import demand
 from utn_sumo.contract import EXIT, Network
+from utn_sumo.errors import NetworkError
 
 STEP_S = 120.0
 HOURS = 2
@@ -168,3 +170,32 @@ def test_a_disturbance_adds_vehicles_amid_every_link_and_changes_no_other(
         assert 0 < float(vehicle.get("departPos", "nan")) < utn17.edge_length_m[edge]
     departures = [float(vehicle.get("depart", "nan")) for vehicle in vehicles]
     assert departures == sorted(departures)
+
+
+def test_turning_fractions_that_never_lead_out_are_refused_before_anything_is_drawn(
+    utn17: Network, tmp_path: Path
+) -> None:
+    """All drive round and round: nobody turns onto a way out."""
+    turns = [replace(turn, fraction=float(turn.next_link != EXIT)) for turn in utn17.turns]
+    with pytest.raises(NetworkError, match=r"link '\d+' leads nowhere out of net 'utn17'.*: give") as caught:
+        draw(replace(utn17, turns=tuple(turns)), tmp_path)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_link_without_a_way_out_matters_only_where_somebody_comes_to_it(utn17: Network, tmp_path: Path) -> None:
+    """Link 9 gets none, from upstream neither: its turns go back to itself."""
+    lost = 8
+    turns = []
+    for turn in utn17.turns:
+        if turn.link == lost:
+            turns.append(replace(turn, next_link=lost))
+        elif turn.next_link == lost:
+            turns.append(replace(turn, fraction=0.0))
+        else:
+            turns.append(turn)
+    links = tuple(replace(link, is_source=link.is_source and index != lost) for index, link in enumerate(utn17.links))
+    net = replace(utn17, turns=tuple(turns), links=links)
+    assert read(draw(net, tmp_path, duration_s=STEP_S))
+    with pytest.raises(NetworkError, match="link '9' leads nowhere out"):
+        draw(net, tmp_path, duration_s=STEP_S, disturbance_veh_h=10.0)
