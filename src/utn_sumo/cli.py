@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import shlex
 import sys
 from collections.abc import Callable
@@ -154,7 +155,7 @@ def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, 
     steps, refit_steps = (_whole(name, flags.pop(name)) for name in ("horizon", "refit_steps"))
     items = [] if folders else [scenario(**flags, seed=seed) for seed in range(1, 1 + _whole("seeds", seeds))]
     for path in folders:
-        recording.read_json(path, recording.SETTINGS)
+        judging.recorded(path)
     if len(folders or items) < 2:  # noqa: PLR2004 - an interval needs two
         raise SettingError("forecasts are judged over runs: give two or more, as --seeds 2 or as folders")
     folder = recording.new_folder(out, "forecast-report")
@@ -168,7 +169,7 @@ def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, 
 @cli.command()
 @_study
 @click.option("--demand", help="Demands, separated by commas.  [0.7,0.9,1.1,1.25; of CASE 1.0]")
-@click.option("--seeds", default="201,202", show_default=True, help="Seeds, separated by commas.")
+@click.option("--seeds", default="201,202", show_default=True, help="Numbers and ranges, separated by commas.")
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder for the runs; must be new or empty."
 )
@@ -177,10 +178,10 @@ def calibrate(out: Path, demand: str | None, seeds: str, **flags: Any) -> None:
 
     CASE is a .sumocfg of your own; the seeds then are SUMO's alone.
     """
-    from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
+    from utn_sumo import campaign, recording, report, study  # noqa: PLC0415 - heavy
 
     demands = _numbers("demand", demand or ("0.7,0.9,1.1,1.25" if flags["case"] is None else "1.0"))
-    seed_list = [int(seed) for seed in _numbers("seeds", seeds)]
+    seed_list = campaign.seeds(seeds)
     base = _base(flags) | {"calibration": "none"}
     folder = recording.new_folder(out, "calibration")
     with report.counter("runs", len(demands) * len(seed_list)) as tick:
@@ -276,13 +277,13 @@ def inspect(net: str, out: Path | None, as_json: bool) -> None:
 @click.option(
     "--calibrate", "calibrated", is_flag=True, help="Fit the model to runs of CASE too: minutes, not seconds."
 )
-@click.option("--seeds", default="201,202", show_default=True, help="Seeds of those runs, separated by commas.")
+@click.option("--seeds", default="201,202", show_default=True, help="Seeds of those runs: numbers and ranges.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
 def import_(case: Path, out: Path, calibrated: bool, seeds: str, as_json: bool) -> None:
     """Make of CASE, a .sumocfg, a folder that is complete in itself, with what the bench makes of net and traffic."""
-    from utn_sumo import importing, recording, report  # noqa: PLC0415 - heavy
+    from utn_sumo import campaign, importing, recording, report  # noqa: PLC0415 - heavy
 
-    seed_list = [int(seed) for seed in _numbers("seeds", seeds)]
+    seed_list = campaign.seeds(seeds)
     found = importing.read(case)
     folder = recording.new_folder(out, "import")
     result = importing.write(found, folder)
@@ -358,16 +359,26 @@ def _base(flags: dict[str, Any]) -> dict[str, Any]:
 
 
 def _step_s(flags: dict[str, Any]) -> float | None:
-    """The model step that is asked for, if any is."""
-    return None if flags["step"] is None else _numbers("step", flags["step"])[0]
+    """The model step that is asked for, if any is. Raises SettingError."""
+    if flags["step"] is None:
+        return None
+    step_s, *more = _numbers("step", flags["step"])
+    if more:
+        raise SettingError(f"setting 'step' is {flags['step']!r}: it must be one number")
+    return step_s
 
 
 def _numbers(name: str, text: str) -> list[float]:
-    """Numbers separated by commas. Raises SettingError."""
+    """Numbers separated by commas, each once. Raises SettingError."""
     try:
-        return [float(word) for word in text.split(",")]
-    except ValueError as error:
-        raise SettingError(f"setting {name!r} is {text!r}: it must be numbers separated by commas") from error
+        found = [float(word) for word in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or not all(map(math.isfinite, found)):
+        raise SettingError(f"setting {name!r} is {text!r}: it must be numbers separated by commas")
+    if len(set(found)) < len(found):
+        raise SettingError(f"setting {name!r} is {text!r}: give each number once")
+    return found
 
 
 def _whole(name: str, text: str) -> int:

@@ -15,18 +15,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from utn_sumo import demand, network, recording
 from utn_sumo.case import SUFFIX
 from utn_sumo.contract import Floats, Network
-from utn_sumo.errors import SettingError
+from utn_sumo.errors import ResultError, SettingError
 from utn_sumo.prediction.predictor import ADOPTED_AFTER, LEAST_ROWS, METHODS, Predictor
 from utn_sumo.recording import Log
-from utn_sumo.scenario import Scenario
+from utn_sumo.scenario import Scenario, explain
 
 FIRST_STEP = LEAST_ROWS + ADOPTED_AFTER
 """From which on forecasts are judged: before it there is none from a fitted model."""
 CONFIDENCE = 0.95
+
+
+def recorded(folder: Path) -> Scenario:
+    """The scenario of a recorded run. Raises ResultError for a folder that holds none."""
+    try:
+        return Scenario(**recording.read_json(folder, recording.SETTINGS)["scenario"])
+    except (KeyError, TypeError, ValidationError) as error:
+        reason = explain(error, Scenario.model_fields) if isinstance(error, ValidationError) else "there is none"
+        raise ResultError(
+            f"{str(folder)!r} lacks a run's scenario ({reason}): give a folder that `utn run` wrote"
+        ) from error
 
 
 def rmse_veh_h(folder: Path, horizon: int, refit_steps: int) -> dict[str, list[float]]:
@@ -34,7 +46,7 @@ def rmse_veh_h(folder: Path, horizon: int, refit_steps: int) -> dict[str, list[f
 
     Raises ResultError for a folder that holds no run, SettingError for a run that is too short.
     """
-    scenario = Scenario(**recording.read_json(folder, recording.SETTINGS)["scenario"])
+    scenario = recorded(folder)
     if scenario.net.endswith(SUFFIX):
         raise SettingError(f"setting 'net' is {scenario.net!r}: forecasts are judged where the demand was drawn")
     net = network.load(scenario.net)

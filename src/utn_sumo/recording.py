@@ -98,12 +98,11 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_json(folder: Path, name: str) -> dict[str, Any]:
-    """A file of a result folder. Raises ResultError if it isn't there or isn't JSON."""
+    """A file of a result folder. Raises ResultError if it isn't there or is no object in JSON."""
     try:
-        content = json.loads((folder / name).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        return dict(json.loads((folder / name).read_text(encoding="utf-8")).items())
+    except (OSError, ValueError, AttributeError) as error:
         raise ResultError(f"{str(folder)!r} holds no readable {name}: give a folder that `utn run` wrote") from error
-    return dict(content)
 
 
 def versions(sumo: str) -> dict[str, str]:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -64,13 +63,13 @@ def progress(scenario: Scenario) -> Iterator[Callable[[RunProgress], None]]:
     so that an error before it stays the only line.
     """
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[state]}"),
     )
-    bar = Progress(*columns, console=Console(stderr=True))
+    bar = Progress(*columns, console=Console(markup=False, stderr=True))
     task = bar.add_task(f"{scenario.controller} on {scenario.net}", total=None, state="")
 
     def show(now: RunProgress) -> None:
@@ -88,7 +87,7 @@ def progress(scenario: Scenario) -> Iterator[Callable[[RunProgress], None]]:
 
 def table(result: dict[str, Any]) -> None:
     """The closing table, what went wrong if anything did, and where the results are."""
-    console = Console()
+    console = Console(markup=False)
     title = "{controller} on {net}, demand {demand:g}, seed {seed}, {hours:.2f} h".format(**result)
     view = Table(title=title, title_justify="left")
     view.add_column("measure")
@@ -101,32 +100,32 @@ def table(result: dict[str, Any]) -> None:
     if brought is not None:
         console.print(_window(brought), highlight=False)
     for reason in [*result.get("unsafe_reasons", []), *result.get("fallback_reasons", [])]:
-        console.print(f"  ! {reason}", markup=False)
+        console.print(f"  ! {reason}")
     if result["left_out_veh"]:
         number = result["left_out_veh"]
-        console.print(f"  ! SUMO left out {number} vehicles: sort their routes by departure", markup=False)
+        console.print(f"  ! SUMO left out {number} vehicles: sort their routes by departure")
     if result["interrupted"]:
         console.print("stopped before its end: the measures cover the time that was run")
-    console.print(f"results: {result['out']}", markup=False)
+    console.print(f"results: {result['out']}")
 
 
 def manual_tables(entries: Sequence[Entry], *, whole: bool) -> None:
     """Controllers and executions with their settings: by name alone, or as a `whole` with what these mean."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
     noun = ""
     for each in entries:
         if each.noun != noun:
             noun = each.noun
-            console.print(f"{noun}s", markup=False, highlight=False)
-        console.print(f"  {each.name}: {each.does}", markup=False, highlight=False)
+            console.print(f"{noun}s", highlight=False)
+        console.print(f"  {each.name}: {each.does}", highlight=False)
         if whole and each.settings:
             view = Table("setting", "default", "may be", "what it is")
             for setting in each.settings:
-                view.add_row(*(escape(text) for text in dataclasses.astuple(setting)))
+                view.add_row(*dataclasses.astuple(setting))
             console.print(view)
         else:
             told = ", ".join(f"{setting.name}={setting.default}" for setting in each.settings) or "none"
-            console.print(f"      settings: {told}", markup=False, highlight=False, soft_wrap=True)
+            console.print(f"      settings: {told}", highlight=False, soft_wrap=True)
     if not whole:
         console.print("utn controllers NAME tells what its settings mean", highlight=False)
 
@@ -142,7 +141,7 @@ def _window(brought: dict[str, Any]) -> str:
 
 def import_table(result: dict[str, Any]) -> None:
     """What has been imported, and how to run it."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
     without_veh = result["without_route_veh"]
     rows = {
         "window": _window(result),
@@ -156,15 +155,13 @@ def import_table(result: dict[str, Any]) -> None:
         "turning fractions": f"in {Path(result['turns']).name}",
         "calibration": Path(result["calibration"]).name if result["calibration"] else "none: utn import --calibrate",
     }
-    view = Table(title=escape(result["scenario"]), title_justify="left", show_header=False)
+    view = Table(title=result["scenario"], title_justify="left", show_header=False)
     view.add_column()
     view.add_column(overflow="fold")
     for label, value in rows.items():
-        view.add_row(escape(label), escape(value))
+        view.add_row(label, value)
     console.print(view)
-    console.print(
-        f"run it with  utn run {shlex.quote(result['scenario'])}", markup=False, highlight=False, soft_wrap=True
-    )
+    console.print(f"run it with  utn run {shlex.quote(result['scenario'])}", highlight=False, soft_wrap=True)
 
 
 @contextmanager
@@ -175,7 +172,7 @@ def counter(label: str, total: int) -> Iterator[Callable[[], None]]:
         BarColumn(),
         TaskProgressColumn(),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=Console(markup=False, stderr=True),
     )
     task = bar.add_task(label, total=total)
 
@@ -192,7 +189,7 @@ def counter(label: str, total: int) -> Iterator[Callable[[], None]]:
 
 def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
     """Error by demand and step ahead, the links that are worst against the floor, and where the rest is."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
     for result in results:
         title = (
             "{controller} on {net}, demand {demand:g}, {n} seeds, model step {step_s:g} s, demand {inputs}, "
@@ -219,8 +216,8 @@ def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
             over = {link: values["rmse_over_floor"][0] for link, values in result["links"].items()}
             worse = sorted((link for link in over if over[link] > FLOOR_LIMIT), key=lambda link: -over[link])
             listed = ", ".join(f"{link} ({over[link]:.2f})" for link in worse) or "none"
-            console.print(f"links over {FLOOR_LIMIT} of the floor one cycle ahead: {listed}", markup=False)
-    console.print(f"plots and mismatch.json: {folder}", markup=False)
+            console.print(f"links over {FLOOR_LIMIT} of the floor one cycle ahead: {listed}")
+    console.print(f"plots and mismatch.json: {folder}")
 
 
 def _controlled(junction: dict[str, Any]) -> str:
@@ -232,7 +229,7 @@ def _controlled(junction: dict[str, Any]) -> str:
 
 def inspection_table(found: dict[str, Any], folder: Path) -> None:
     """Junctions, links, and what is left alone."""
-    console = Console(width=None if sys.stdout.isatty() else 140)
+    console = Console(markup=False, width=None if sys.stdout.isatty() else 140)
     view = Table(title=f"{found['net']}: control step {found['control_step_s']:g} s", title_justify="left")
     for head in ("junction", "cycle (s)", "offset (s)", "stages", "green to share (s)", "links", "controlled"):
         view.add_column(head)
@@ -264,12 +261,12 @@ def inspection_table(found: dict[str, Any], folder: Path) -> None:
         numbers = [f"{each[key]:.0f}" for key in ("lanes", "length_m", "storage_veh", "saturation_flow_veh_h")]
         view.add_row(each["id"], each["junction"], *numbers, "yes" if each["is_source"] else "", turns)
     console.print(view)
-    console.print(f"map.png and inspection.json: {folder}", markup=False, highlight=False)
+    console.print(f"map.png and inspection.json: {folder}", highlight=False)
 
 
 def forecast_table(result: dict[str, Any], folder: Path) -> None:
     """Error by method and step ahead, with intervals."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
     title = "RMSE of a source's demand (veh/h), {net}, demand {demand:g}, noise {noise:g}, {runs} runs of {hours:g} h"
     view = Table(title=title.format(**result), title_justify="left")
     view.add_column("method")
@@ -287,12 +284,12 @@ def forecast_table(result: dict[str, Any], folder: Path) -> None:
         )
     console.print(view)
     console.print("intervals within runs: what one run has more error than another is taken away", highlight=False)
-    console.print(f"plot and forecasts.json: {folder}", markup=False, highlight=False)
+    console.print(f"plot and forecasts.json: {folder}", highlight=False)
 
 
 def calibration_table(content: dict[str, Any]) -> None:
     """Parameters by link with their standard errors."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
     view = Table(title="start-up lag {:.2f} s (standard error {:.2f})".format(*content["startup_lag_s"]))
     keys = ("saturation_flow_veh_s", "storage_veh", "free_speed_m_s")
     for head in ("link", *keys, "turns"):
@@ -305,10 +302,10 @@ def calibration_table(content: dict[str, Any]) -> None:
 
 def tuning_table(found: dict[str, Any]) -> None:
     """The best settings beside the defaults, what they are worth, and how to run them."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
     states = [trial["state"] for trial in found["trials"]]
     failed = len(states) - states.count("whole") - states.count("cut")
-    console.print("{controller}: scenarios {scenarios}, seeds {seeds}".format(**found), markup=False, highlight=False)
+    console.print("{controller}: scenarios {scenarios}, seeds {seeds}".format(**found), highlight=False)
     console.print(f"trials {len(states) - 1}, cut short {states.count('cut')}, failed {failed}", highlight=False)
     view = Table()
     for head in ("setting", "default", "best"):
@@ -324,18 +321,18 @@ def tuning_table(found: dict[str, Any]) -> None:
         console.print(f"  ! {best['alarms']} unsafe seconds, fallbacks and teleports with them", highlight=False)
     for trial in found["trials"]:
         if trial["state"] not in {"whole", "cut"}:
-            console.print(f"  ! trial {trial['trial']}: {trial['state']}", markup=False, highlight=False)
+            console.print(f"  ! trial {trial['trial']}: {trial['state']}", highlight=False)
     if found["left"]:
-        console.print(f"not searched: {', '.join(found['left'])}", markup=False, highlight=False)
+        console.print(f"not searched: {', '.join(found['left'])}", highlight=False)
     folder = Path(found["out"])
-    console.print(f"trials: {folder}", markup=False, highlight=False)
+    console.print(f"trials: {folder}", highlight=False)
     file = shlex.quote(str(folder / "best.toml"))
-    console.print(f"run it with  utn run --scenario {file}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"run it with  utn run --scenario {file}", highlight=False, soft_wrap=True)
 
 
 def paper_table(results: list[dict[str, Any]], folder: Path) -> None:
     """The paper's table beside ours, one for each plant and demand."""
-    console = Console(width=None if sys.stdout.isatty() else 140)
+    console = Console(markup=False, width=None if sys.stdout.isatty() else 140)
     published = [each for each in results if each["plant"] == "paper"]
     ours: dict[tuple[str, float], list[dict[str, Any]]] = {}
     for each in results:
@@ -348,7 +345,7 @@ def paper_table(results: list[dict[str, Any]], folder: Path) -> None:
         "constraints: greens fill their cycle and keep their least, links take what they hold", highlight=False
     )
     console.print("in brackets: by how much DMPC beside it differs from that", highlight=False)
-    console.print(f"figures and paper.json: {folder}", markup=False, highlight=False)
+    console.print(f"figures and paper.json: {folder}", highlight=False)
 
 
 def _beside(title: str, columns: list[dict[str, Any]]) -> Table:

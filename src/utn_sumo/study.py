@@ -138,7 +138,7 @@ def study_forecasts(
         for found in pool.map(_judge, jobs):
             runs.append(found)
             tick()
-    first = recording.read_json(folders[0], recording.SETTINGS)["scenario"]
+    first = forecast_report.recorded(folders[0]).model_dump()
     kept = ("net", "controller", "demand", "profile", "noise", "hours")
     result = {
         **{name: first[name] for name in kept},

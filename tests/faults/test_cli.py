@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from utn_sumo import sumo_tools
+from utn_sumo.contract import Network
 
 Utn = Callable[..., subprocess.CompletedProcess[str]]
 SHORT = ("run", "--controller", "fixed", "--hours", "0.1")
@@ -98,6 +100,13 @@ MISTAKES: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
     "tuning on an unknown net": (("tune", "max_wave", "--nets", "utn71"), "'utn71'", "did you mean 'utn17"),
     "tuning with seeds in letters": (("tune", "max_wave", "--seeds", "a-b"), "'seeds' is 'a-b'", "as in 1-3,7"),
+    "seeds that are no numbers": (("calibrate", "--seeds", "nan", "--out", "new"), "'seeds' is 'nan'", "as in 1-3,7"),
+    "endless seeds": (("import", "x.sumocfg", "--seeds", "inf", "--out", "new"), "'seeds' is 'inf'", "as in 1-3,7"),
+    "parts of seeds": (("calibrate", "--seeds", "7.9", "--out", "new"), "'seeds' is '7.9'", "as in 1-3,7"),
+    "demand twice": (("mismatch", "--demand", "1.0,1", "--out", "new"), "'demand' is '1.0,1'", "each number once"),
+    "demand that is no number": (("calibrate", "--demand", "nan", "--out", "new"), "'demand' is 'nan'", "numbers"),
+    "step that is no number": (("mismatch", "--step", "nan", "--out", "new"), "'step' is 'nan'", "must be numbers"),
+    "two steps": (("mismatch", "--step", "10,20", "--out", "new"), "'step' is '10,20'", "one number"),
     "replay of nothing": (("replay", "none"), "'none'", "give a folder that `utn run` wrote"),
 }
 
@@ -166,6 +175,16 @@ def test_a_run_prints_its_measures_and_where_the_results_are(utn: Utn, folder: P
     again = utn(*SHORT)
     assert again.returncode == 0, again.stderr
     assert len(list((folder / "results").iterdir())) == 2
+
+
+def test_names_in_brackets_are_printed_as_they_are(utn: Utn, folder: Path, utn17: Network) -> None:
+    (folder / "a[").mkdir()
+    net = Path(shutil.copyfile(utn17.net_file, folder / "a[" / "x].net.xml"))
+    for command in (("run", "--controller", "fixed", "--hours", "0.1", "--net"), ("inspect",)):
+        done = utn(*command, f"a[/{net.name}")
+        assert done.returncode == 0, done.stderr
+        assert "x]" in done.stdout
+        assert done.stderr == "" or "Traceback" not in done.stderr
 
 
 def test_a_scenario_file_says_what_flags_say_and_flags_win(utn: Utn, folder: Path) -> None:
@@ -247,6 +266,9 @@ def trips(file: Path) -> list[dict[str, str]]:
         (("run", "--calibration", "nowhere.json"), ["'nowhere.json'", "can't be read", "utn calibrate"]),
         (("run", "--net", "routes.xml"), ["'routes.xml'", "holds no roads", "netconvert"]),
         (("forecast-report", "nowhere"), ["'nowhere'", "settings.json"]),
+        (("forecast-report", "empty", "empty"), ["'empty'", "a run's scenario", "`utn run` wrote"]),
+        (("forecast-report", "list", "list"), ["'list'", "settings.json", "`utn run` wrote"]),
+        (("forecast-report", "typo", "typo"), ["'typo'", "'hourz' is unknown", "`utn run` wrote"]),
     ],
     ids=lambda value: " ".join(value[:3]) if isinstance(value, tuple) else "",
 )
@@ -254,6 +276,9 @@ def test_what_cannot_be_is_said_before_anything_is_run(
     utn: Utn, folder: Path, arguments: tuple[str, ...], words: list[str]
 ) -> None:
     (folder / "file").touch()
+    for name, content in {"empty": "{}", "list": "[]", "typo": '{"scenario": {"hourz": 1}}'}.items():
+        (folder / name).mkdir()
+        (folder / name / "settings.json").write_text(content, encoding="utf-8")
     (folder / "routes.xml").write_text("<routes/>", encoding="utf-8")
     line = one_line(utn(*arguments))
     assert [word for word in words if word not in line] == []
