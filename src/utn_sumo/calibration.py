@@ -9,7 +9,7 @@ net, or named in a scenario; the demand and the plant never see it, only the mod
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,8 @@ COMMON_SHARE = 0.3
 """Standard deviation of what the links have in common about what the net says, relative."""
 LAG_PRIOR_S = 2.0
 EVALUATIONS = 8
+WHOLE = 1e-3
+"""By how much the turning fractions of a link in a file may sum to other than 1."""
 HORIZON = 4
 FITTED_AHEAD = (0, HORIZON - 1)
 """Control steps ahead whose errors are fitted: one step alone would let a parameter be right first and wrong later."""
@@ -182,6 +184,7 @@ def applied(network: Network, path: Path) -> Network:
             for turn in network.turns
         )
         lag_s = float(content["startup_lag_s"][0])
+        _check(network, [turn.fraction for turn in turns], lag_s)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise NetworkError(
             f"calibration {str(path)!r} does not fit net {network.name!r} (lacks or misplaces {error}): make one with "
@@ -197,3 +200,16 @@ def _values(link: Mapping[str, Any]) -> dict[str, Any]:
         if not 0 < value < np.inf:
             raise ValueError(f"{name} is {value:g}")
     return values
+
+
+def _check(network: Network, fractions: Sequence[float], lag_s: float) -> None:
+    """Raise ValueError unless the turning fractions (M,) of each link are shares of 1, and the lag is from 0 on."""
+    if not 0 <= lag_s < np.inf:
+        raise ValueError(f"startup_lag_s is {lag_s:g}")
+    for turn, share in zip(network.turns, fractions, strict=True):
+        if not 0 <= share <= 1:
+            raise ValueError(f"the fraction of {network.links[turn.link].id} to {turn.to_edge} is {share:g}")
+    total = np.bincount(network.turn_link, fractions)
+    for index in set(network.turn_link.tolist()):
+        if abs(total[index] - 1) > WHOLE:
+            raise ValueError(f"the fractions of {network.links[index].id} sum to {total[index]:g}")

@@ -95,3 +95,29 @@ def test_runs_of_unlike_length_are_put_together_as_far_as_the_shortest_goes(utn1
     both = Log.stack([whole, part])
     assert both.x_veh.shape[:2] == (5, 2)
     assert (both.green_s[:, 0] == both.green_s[:, 1]).all()
+
+
+@pytest.mark.parametrize(
+    ("share", "lag_s", "says"),
+    [
+        (-0.2, 2.0, "the fraction of 1 to .* is -0.2"),
+        (1.4, 2.0, "the fraction of 1 to .* is 1.4"),
+        (float("nan"), 2.0, "the fraction of 1 to .* is nan"),
+        (0.99, 2.0, "the fractions of 1 sum to"),
+        (None, -1.0, "startup_lag_s is -1"),
+        (None, float("inf"), "startup_lag_s is inf"),
+    ],
+)
+def test_shares_that_are_none_and_lags_that_can_not_be_are_refused(
+    utn17: Network, tmp_path: Path, share: float | None, lag_s: float, says: str
+) -> None:
+    content = json.loads(calibration.beside_net(utn17).read_text(encoding="utf-8"))
+    content["startup_lag_s"][0] = lag_s
+    if share is not None:
+        turns = content["links"]["1"]["turns"]
+        turns[next(iter(turns))][0] = share
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(NetworkError, match=says) as caught:
+        calibration.applied(utn17, path)
+    assert "\n" not in str(caught.value)
