@@ -48,6 +48,15 @@ class Scenario(BaseModel):
     """Calibration file for the model; `none` for none, else the one beside the net if there is one."""
     seed: int = Field(1, ge=0, le=2**31 - 1)
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_flag(cls, value: Any) -> Any:
+        # It would pass for 1 or 0.
+        if isinstance(value, bool):
+            message = "it must be a number or a name"
+            raise ValueError(message)  # noqa: TRY004 - pydantic takes no TypeError
+        return value
+
     @field_validator("hours")
     @classmethod
     def _lasts(cls, hours: float) -> float:

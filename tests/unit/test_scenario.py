@@ -144,3 +144,11 @@ def test_an_executions_settings_are_a_table_in_the_settings_and_flags_win(tmp_pa
     assert chosen.execution_settings == {"gap_s": 4, "other": 1}
     assert chosen.controller_settings == {"horizon": 5, "cost": "paper"}
     assert scenario(file).execution_settings == {"gap_s": 2, "other": 1}
+
+
+@pytest.mark.parametrize("name", ["hours", "demand", "seed", "refit_steps"])
+def test_a_truth_is_no_number(name: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(f"{name} = true", encoding="utf-8")
+    with pytest.raises(SettingError, match=f"setting '{name}' is True: it must be a number"):
+        scenario(file)
