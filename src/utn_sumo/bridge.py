@@ -18,6 +18,7 @@ from utn_sumo import (
     demand,
     metrics,
     monitor,
+    native,
     quiet,
     recording,
     streets,
@@ -201,12 +202,24 @@ def _predictor(net: Network, scenario: Scenario, driving: Path | Case, steps: in
 
 
 def check_execution(scenario: Scenario) -> None:
-    """Raise SettingError for an execution beside signals that SUMO switches itself."""
-    if scenario.execution is not None and scenario.controller in sumo_signals.RUNS:
+    """Raise SettingError for what only our own controllers take beside signals that SUMO switches itself: an execution,
+    a calibration, and under `native` any setting.
+    """
+    if scenario.controller not in sumo_signals.RUNS:
+        return
+    if scenario.execution is not None:
         raise SettingError(
             f"setting 'execution' is {scenario.execution!r}: controller {scenario.controller!r} plans nothing that "
             "could be carried out, SUMO switches its signals: leave it out"
         )
+    if scenario.calibration not in {None, "none"}:
+        raise SettingError(
+            f"setting 'calibration' is {scenario.calibration!r}: controller {scenario.controller!r} has no model, "
+            "SUMO switches its signals: leave it out"
+        )
+    if scenario.controller == native.NAME and scenario.settings:
+        name = next(iter(scenario.settings))
+        raise SettingError(f"controller {scenario.controller!r} has no setting {name!r}: it takes none")
 
 
 class _Tally:

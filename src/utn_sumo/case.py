@@ -142,13 +142,11 @@ class Case:
 
 def read(path: Path) -> Case:
     """Read a .sumocfg. Raises SettingError with one line if it can't be used."""
-    said: dict[str, str] = {}
-    for section in elements(path, "scenario", "give a .sumocfg"):
-        for option in [section, *section]:
-            name, value = LONG.get(option.tag, option.tag), option.get("value", option.get("v"))
-            if value is None or section.tag in ABOUT_OUTPUT or name in SHOWN | LEFT or WRITTEN.match(name):
-                continue
-            said[name] = "1" if name == RECORDED else value
+    if "," in str(path.resolve()):
+        raise SettingError(
+            f"scenario {str(path)!r} lies under a name with a comma, which SUMO parts lists at: rename it"
+        )
+    said = _said(path)
     if "net-file" not in said:
         raise SettingError(f"scenario {str(path)!r} names no net-file: give a whole .sumocfg")
     found = {name: _files(path, name, said.get(name, "")) for name in ("net-file", "route-files", "additional-files")}
@@ -157,7 +155,7 @@ def read(path: Path) -> Case:
     for name in FILES:
         if name in said:
             said[name] = _joined(_files(path, name, said[name]))
-    end_s = _seconds(path, "end", said["end"]) if "end" in said else -1.0
+    begin_s, end_s = _window_s(path, said)
     if not _seconds(path, "step-length", said.get("step-length", "1")) > 0:
         raise SettingError(f"scenario {str(path)!r}: step-length is {said['step-length']!r}: make it more than 0 s")
     if not _is_number(said.get("scale", "1")):
@@ -167,8 +165,8 @@ def read(path: Path) -> Case:
         net_file=found["net-file"][0],
         route_files=found["route-files"],
         additional_files=found["additional-files"],
-        begin_s=_seconds(path, "begin", said.get("begin", "0")),
-        end_s=end_s if end_s >= 0 else None,
+        begin_s=begin_s,
+        end_s=end_s,
         teleport_s=_seconds(path, "time-to-teleport", said.get("time-to-teleport", str(DEFAULT_TELEPORT_S))),
         options=tuple((name, value) for name, value in said.items() if name not in OURS),
         seeds=tuple((name, value) for name, value in said.items() if name in SEEDS),
@@ -228,6 +226,25 @@ def seconds(text: str) -> float:
     if len(parts) > len(UNITS_S) or not all(map(math.isfinite, parts)):
         raise ValueError(text)
     return sum(part * unit for part, unit in zip(reversed(parts), UNITS_S, strict=False))
+
+
+def _said(path: Path) -> dict[str, str]:
+    """The options that count, by their long names."""
+    said: dict[str, str] = {}
+    for section in elements(path, "scenario", "give a .sumocfg"):
+        for option in [section, *section]:
+            name, value = LONG.get(option.tag, option.tag), option.get("value", option.get("v"))
+            if value is None or section.tag in ABOUT_OUTPUT or name in SHOWN | LEFT or WRITTEN.match(name):
+                continue
+            said[name] = "1" if name == RECORDED else value
+    return said
+
+
+def _window_s(path: Path, said: Mapping[str, str]) -> tuple[float, float | None]:
+    begin_s, end_s = (_seconds(path, name, said.get(name, usual)) for name, usual in (("begin", "0"), ("end", "-1")))
+    if 0 <= end_s <= begin_s:
+        raise SettingError(f"scenario {str(path)!r}: end is {said['end']!r}, not after its begin: make it later")
+    return begin_s, end_s if end_s >= 0 else None
 
 
 def _seconds(path: Path, name: str, text: str) -> float:

@@ -42,8 +42,9 @@ def new_folder(path: Path | None, default_name: str) -> Path:
     """
     if path is None:
         return _numbered(Path("results"), default_name)
-    if ":" in str(path):
-        raise ResultError(f"output folder {str(path)!r} has a colon, which SUMO takes for host:port: name another")
+    for sign, taken in ((":", "a colon, which SUMO takes for host:port"), (",", "a comma, which SUMO parts lists at")):
+        if sign in str(path):
+            raise ResultError(f"output folder {str(path)!r} has {taken}: name another")
     try:
         if path.exists() and not path.is_dir():
             raise ResultError(f"output folder {str(path)!r} is a file: name another with --out")

@@ -121,6 +121,13 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "two nets": (edit("town.sumocfg", "town.net.xml", "town.net.xml,town.net.xml"), "net-file is .*: name one file"),
     "steps of no length": (edit("town.sumocfg", "<end", '<step-length value="0"/><end'), "step-length is '0': make it"),
+    **{
+        f"end {where} its begin": (
+            edit("town.sumocfg", 'begin value="0"', f'begin value="{begin_s}"'),
+            "end is '60', not after its begin: make it later",
+        )
+        for where, begin_s in (("before", 90), ("at", 60))
+    },
     "scale in words": (edit("town.sumocfg", "<end", '<scale value="twice"/><end'), "scale is 'twice'"),
 }
 
@@ -168,3 +175,27 @@ def test_nothing_is_imported_over_what_is_there(broken: Path, capsys: pytest.Cap
     before = {path.name: path.read_bytes() for path in broken.iterdir()}
     assert "name another with --out" in line(["import", "town.sumocfg", "--out", "."], capsys)
     assert {path.name: path.read_bytes() for path in broken.iterdir()} == before
+
+
+def test_commas_in_paths_are_refused(broken: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "'a,b' has a comma" in line(["run", "town.sumocfg", "--controller", "native", "--out", "a,b"], capsys)
+    assert not Path("a,b").exists()
+    broken.rename(broken.with_name("he,re"))
+    elsewhere = f"{broken.with_name('he,re')}/town.sumocfg"
+    assert "a name with a comma" in line(["run", elsewhere, "--controller", "native", "--out", "out"], capsys)
+
+
+@pytest.mark.usefixtures("broken")
+@pytest.mark.parametrize(
+    ("controller", "more", "says"),
+    [
+        ("native", ["--set", "foo=1"], "'native' has no setting 'foo': it takes none"),
+        ("native", ["--calibration", "nowhere.json"], "'calibration' is 'nowhere.json': .*leave it out"),
+        ("actuated", ["--calibration", "nowhere.json"], "'calibration' is 'nowhere.json': .*leave it out"),
+    ],
+)
+def test_what_sumo_s_own_signals_do_not_take_is_refused(
+    controller: str, more: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert re.search(says, line(["run", "town.sumocfg", "--controller", controller, "--out", "out", *more], capsys))
+    assert not Path("out").exists()
