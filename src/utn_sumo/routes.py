@@ -97,6 +97,8 @@ class _Kind(NamedTuple):
     vclass: str
     length_m: float
     gap_m: float
+    scale: float = 1.0
+    """How many of each of its vehicles drive."""
 
 
 T = TypeVar("T")
@@ -146,9 +148,10 @@ class _Reader:
         space_veh_m, shortest_m = 0.0, CAR_M[0]
         for name, (veh, who) in self.by_type.items():
             for kind, share in _known(self.kinds, name, who):
-                by_class_veh[kind.vclass] += veh * share
+                driving_veh = veh * share * kind.scale
+                by_class_veh[kind.vclass] += driving_veh
                 if kind.vclass in MOTOR:
-                    space_veh_m += veh * share * (kind.length_m + kind.gap_m)
+                    space_veh_m += driving_veh * (kind.length_m + kind.gap_m)
                 if kind.vclass in (*MOTOR, "bicycle"):
                     shortest_m = min(shortest_m, kind.length_m)
         total_veh = sum(veh for vclass, veh in by_class_veh.items() if vclass in MOTOR)
@@ -170,6 +173,8 @@ class _Reader:
         kind, route = element.get("type", DEFAULT_TYPE), element.get("route")
         before, first = self.by_type.get(kind, (0.0, who))
         self.by_type[kind] = before + veh, first
+        # Types stand before those who drive them, as a rule: SUMO may read one from another file in time.
+        veh *= sum(share * each.scale for each, share in self.kinds[kind]) if kind in self.kinds else 1.0
         own = next((child for child in element if child.tag in WAYS), None)
         if own is not None:
             for way, share in self._ways(own):
@@ -248,7 +253,7 @@ class _Reader:
         vclass = element.get("vClass", CAR)
         length_m, gap_m = LENGTH_AND_GAP_M.get(vclass, CAR_M)
         size = self._number(element, "length", length_m), self._number(element, "minGap", gap_m)
-        kind = [(_Kind(vclass, *size), 1.0)]
+        kind = [(_Kind(vclass, *size, self._number(element, "scale", 1.0)), 1.0)]
         self.kinds[element.get("id", "")] = kind
         return kind
 

@@ -194,14 +194,26 @@ def test_lengths_and_gaps_are_sumo_s_own(utn17: Network, tmp_path: Path) -> None
     assert built_in == routes.BUILT_IN
 
 
-def test_turns_are_those_of_the_vehicles_that_sumo_sends(utn17: Network, tmp_path: Path) -> None:
-    content = """
+@pytest.mark.parametrize(
+    "content",
+    [
+        """
     <route id="r" edges="1 10"/>
     <flow id="f" begin="0" period="30" route="r"/>
     <flow id="g" begin="0" end="900" number="9"><route edges="1 W1"/></flow>
     <flow id="h" begin="60" period="60" number="5"><route edges="2 10"/></flow>
     <vehicle id="v" depart="300"><route edges="2 N1"/></vehicle><vehicle id="w" depart="900" route="r"/>
-    """
+    """,
+        """
+    <vType id="half" scale="0.5"/><vType id="double" scale="2"/>
+    <flow id="f" type="half" begin="100" end="600" number="40"><route edges="1 10"/></flow>
+    <flow id="g" type="double" begin="100" end="600" number="10"><route edges="2 10"/></flow>
+    <vehicle id="v" type="double" depart="300"><route edges="2 N1"/></vehicle>
+    """,
+    ],
+    ids=["each once", "types with a scale"],
+)
+def test_turns_are_those_of_the_vehicles_that_sumo_sends(utn17: Network, tmp_path: Path, content: str) -> None:
     found = traffic(tmp_path, content, begin_s=100.0, end_s=600.0)
     out = tmp_path / "routes.xml"
     subprocess.run(
@@ -214,6 +226,16 @@ def test_turns_are_those_of_the_vehicles_that_sumo_sends(utn17: Network, tmp_pat
     )
     sent = Counter(turn for route in ET.parse(out).iter("route") for turn in pairwise(route.attrib["edges"].split()))
     assert found.turned_veh == pytest.approx(dict(sent))
+
+
+def test_of_a_type_with_a_scale_so_many_drive(tmp_path: Path) -> None:
+    """They take as much room, and are as many of their class, wherever their type stands."""
+    types = '<vType id="bus" vClass="bus" scale="0.5"/><vType id="car"/>'
+    mixed = '<vTypeDistribution id="some" vTypes="bus car" probabilities="0.5 0.5"/>'
+    found = traffic(tmp_path, f'{types}{mixed}<flow id="f" type="some" number="8" begin="0" end="100">{OWN}</flow>')
+    assert found.by_class_veh == {"bus": 2, "passenger": 4}
+    assert found.turned_veh["a", "b"] == 6
+    assert found.space_m == pytest.approx((2 * 14.5 + 4 * 7.5) / 6)
 
 
 @pytest.mark.parametrize(
