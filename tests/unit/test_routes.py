@@ -229,7 +229,7 @@ def test_turns_are_those_of_the_vehicles_that_sumo_sends(utn17: Network, tmp_pat
 
 
 def test_of_a_type_with_a_scale_so_many_drive(tmp_path: Path) -> None:
-    """They take as much room, and are as many of their class, wherever their type stands."""
+    """They take as much room, and are as many of their class."""
     types = '<vType id="bus" vClass="bus" scale="0.5"/><vType id="car"/>'
     mixed = '<vTypeDistribution id="some" vTypes="bus car" probabilities="0.5 0.5"/>'
     found = traffic(tmp_path, f'{types}{mixed}<flow id="f" type="some" number="8" begin="0" end="100">{OWN}</flow>')
