@@ -4,6 +4,10 @@ While the queue towards him goes there are none. Then the fewer come the more th
 which each gap must last some time (the Highway Capacity Manual's permitted turns), so that a green is worth most when
 it has lasted. Behind who waits stand all on his lane: it goes by as much faster as fewer of it wait.
 
+With other lanes beside it that average will not do: a lane goes until the first who waits comes to its front, then it
+stands while the others go, and a green that is kept for what it would let go on average is kept for long. Which lanes
+stand in the present green is seen by who has left them.
+
 Where another stage of the junction has a lane set to itself, yielding.py has learnt what it does.
 """
 
@@ -88,7 +92,7 @@ class Giving:
         """(J,) when that was."""
         self._left_veh = np.zeros(len(network.lane_sets))
         """(L,) who had left by then."""
-        self._is_needed = bool(foes)
+        self._is_needed = bool(self.gaps.beside.any()) and any(foes.values())
 
     def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats) -> None:
         """Take up how fast those go who have green before the junctions `asked` (J,); as Yielding.look."""
