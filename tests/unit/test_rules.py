@@ -69,8 +69,18 @@ def by_movements(network: Network, veh: Floats) -> Floats:
     lanes = [len(group.lanes) for group in network.groups]
     taking = np.bincount(network.turn_group, network.fraction, len(lanes))
     worth = np.zeros(len(network.stages))
+    first = [
+        {
+            turn
+            for letter, turns in zip(shown.state, network.junctions[shown.junction].signal_turns, strict=True)
+            for turn in turns
+            if letter == "G"
+        }
+        for shown in network.stages
+    ]
     for stage, shown in enumerate(network.stages):
-        for turn in shown.turns:
+        # Who gives way counts if he never goes first.
+        for turn in first[stage] | (set(shown.turns) - set().union(*first)):
             each = network.turns[turn]
             weight = veh[each.group] / lanes[each.group]
             if each.next_link != EXIT and network.links[each.next_link].junction != shown.junction:

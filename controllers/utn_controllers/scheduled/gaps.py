@@ -143,7 +143,7 @@ def _see(
         since_s = time_s - looked_s[junction]
         if not queued[lane_set] or looked_s[junction] < begin_s[junction] + START_S:
             flowing[lane_set] = 1.0
-        else:
+        elif since_s > 0:
             gone = min((left[lane_set] - before[lane_set]) / (flow[lane_set] * since_s), 1.0)
             flowing[lane_set] += min(since_s / MEMORY_S, 1.0) * (gone - flowing[lane_set])
         queued[lane_set] = near[lane_set] >= 1
