@@ -17,8 +17,6 @@ from threadpoolctl import threadpool_limits
 from utn_controllers.mpc.region import Region
 from utn_sumo.errors import ControllerError
 
-LOST = ControllerError("a process of the agents has ended: see what it printed")
-
 
 class Crew(Protocol):
     """Some regions, all of which do the same thing at a time."""
@@ -68,7 +66,7 @@ class Processes:
     def call(self, method: str, *arguments: Sequence[Any]) -> list[Any]:
         sent = [_sent(pipe, (method, own)) for pipe, *own in zip(self.pipes, *arguments, strict=True)]
         # All answers are fetched before any error is raised: none must be left for the next call.
-        answers = [_received(pipe) if is_sent else LOST for pipe, is_sent in zip(self.pipes, sent, strict=True)]
+        answers = [_received(pipe) if is_sent else _lost() for pipe, is_sent in zip(self.pipes, sent, strict=True)]
         for answer in answers:
             if isinstance(answer, Exception):
                 raise answer
@@ -88,7 +86,11 @@ def _received(pipe: Connection) -> Any:
     try:
         return pipe.recv()
     except (EOFError, OSError):
-        return LOST
+        return _lost()
+
+
+def _lost() -> ControllerError:
+    return ControllerError("a process of the agents has ended: see what it printed")
 
 
 def _serve(pipe: Connection, build: Callable[[], Region]) -> None:

@@ -9,6 +9,8 @@ moves.py        what moves in a stage, and in the clearance between two
 gaps.py         who goes in the gaps of what comes towards him
 yielding.py     who gives way, or stands behind a red: how fast he has gone of late
 outlook.py      who stands and who comes, by stream
+parked.py       who stands on the way and does not come
+calling.py      who walks, rides or takes a tram, and calls for green himself
 pockets.py      who is held up by a full pocket
 worth.py        what a vehicle's waiting weighs, and how many go where links are full
 ending.py       what it costs to leave somebody there at a schedule's end

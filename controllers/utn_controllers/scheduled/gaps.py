@@ -19,12 +19,11 @@ import numpy as np
 
 from utn_controllers.scheduled.standstill import Shown
 from utn_controllers.scheduled.streams import Streams
+from utn_controllers.scheduled.yielding import MEMORY_S, START_S
 from utn_sumo.clearances import GIVES_WAY, HAS_WAY
 from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
-START_S, MEMORY_S = 3.0, 10.0
-"""From a green's begin until it is seen who goes, and over how much green it is taken."""
 ALL = 0.95
 """Who discharges at so much of what he can has a queue."""
 GAP_S = 4.0
