@@ -9,17 +9,21 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
 from utn_sumo import bridge, processes
 from utn_sumo.errors import SettingError, UtnError
-from utn_sumo.scenario import scenario
+from utn_sumo.scenario import LAST_SEED, scenario
 
 FAILED = "failed"
 """In the place of measures: the one line that says why a run has none."""
 
 STOP = (signal.SIGINT,)
+
+MOST_SEEDS = 10_000
+"""More runs than that of one kind nobody waits for."""
 
 Job = Mapping[str, Any]
 """Settings of a run, as `scenario` takes them."""
@@ -55,14 +59,25 @@ def seeds(text: str) -> list[int]:
     for part in text.split(","):
         first, dash, last = (word.strip() for word in part.partition("-"))
         ends = (first, last if dash else first)
-        if not all(end.isdecimal() for end in ends) or int(ends[0]) > int(ends[1]):
-            raise SettingError(f"setting 'seeds' is {text!r}: write numbers and ranges with commas, as in 1-3,7")
-        found |= dict.fromkeys(range(int(ends[0]), int(ends[1]) + 1))
+        if not all(map(_is_seed, ends)) or int(ends[0]) > int(ends[1]):
+            raise SettingError(
+                f"setting 'seeds' is {text!r}: write numbers up to {LAST_SEED} and ranges with commas, as in 1-3,7"
+            )
+        found |= dict.fromkeys(range(int(ends[0]), int(ends[1]) + 1)[: MOST_SEEDS + 1])
+        if len(found) > MOST_SEEDS:
+            raise SettingError(f"setting 'seeds' is {text!r}: name no more than {MOST_SEEDS}")
     return list(found)
 
 
+def _is_seed(word: str) -> bool:
+    """Whether it is a number that a scenario takes as its seed."""
+    return word.isdecimal() and len(word) <= len(str(LAST_SEED)) and int(word) <= LAST_SEED
+
+
 def _alone(job: Job) -> dict[str, Any]:
-    # The process inherits the mask: a Ctrl-C ends its run, and is silent before and after it.
+    # The process inherits the mask: a Ctrl-C ends its run, and is silent before and after it. Where Python's resource
+    # tracker has yet to be started, which the first process needs, that takes the mask away: so it comes before.
+    resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP)
     with processes.pool(1) as process:
         try:

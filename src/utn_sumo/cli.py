@@ -104,7 +104,7 @@ def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: s
 
     CASE is a .sumocfg of your own; the seeds then are SUMO's alone.
     """
-    from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
+    from utn_sumo import campaign, recording, report, study  # noqa: PLC0415 - heavy
 
     own = flags["case"] is not None
     if own and with_floor:
@@ -112,7 +112,7 @@ def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: s
     with_floor = not own if with_floor is None else with_floor
     base = _base(flags) | ({} if flags["calibration"] is None else {"calibration": flags["calibration"]})
     demands = _numbers("demand", demand or ("1.0" if own else "0.6,1.0,1.3"))
-    seeds = range(1, 1 + _whole("seeds", flags["seeds"]))
+    seeds = campaign.seeds(f"1-{_whole('seeds', flags['seeds'])}")
     horizon, step_s = _whole("horizon", flags["horizon"]), _step_s(flags)
     folder = recording.new_folder(out, f"mismatch-{Path(base['net']).name.partition('.')[0]}-{flags['controller']}")
     total = len(demands) * (len(seeds) + with_floor)
@@ -148,12 +148,13 @@ def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: s
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
 def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, as_json: bool, **flags: Any) -> None:
     """Measure the forecasts' errors by method on the recorded runs in FOLDERS, or on runs made for it."""
+    from utn_sumo import campaign, recording, report, study  # noqa: PLC0415 - heavy
     from utn_sumo import forecast_report as judging  # noqa: PLC0415 - heavy
-    from utn_sumo import recording, report, study  # noqa: PLC0415 - heavy
     from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy
 
     steps, refit_steps = (_whole(name, flags.pop(name)) for name in ("horizon", "refit_steps"))
-    items = [] if folders else [scenario(**flags, seed=seed) for seed in range(1, 1 + _whole("seeds", seeds))]
+    seed_list = campaign.seeds(f"1-{_whole('seeds', seeds)}")
+    items = [] if folders else [scenario(**flags, seed=seed) for seed in seed_list]
     for path in folders:
         judging.recorded(path)
     if len(folders or items) < 2:  # noqa: PLR2004 - an interval needs two

@@ -16,6 +16,9 @@ EXACT = "exact"
 OF_EXECUTION = "execution."
 """How the names of an execution's settings begin where they stand beside the controller's."""
 
+LAST_SEED = 2**31 - 1
+"""The largest that SUMO takes."""
+
 
 class Scenario(BaseModel):
     """Settings of one run; each is checked here, once."""
@@ -46,7 +49,7 @@ class Scenario(BaseModel):
     """Control steps between two fits of the forecast's model."""
     calibration: str | None = None
     """Calibration file for the model; `none` for none, else the one beside the net if there is one."""
-    seed: int = Field(1, ge=0, le=2**31 - 1)
+    seed: int = Field(1, ge=0, le=LAST_SEED)
 
     @field_validator("*", mode="before")
     @classmethod
