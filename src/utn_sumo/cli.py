@@ -7,7 +7,8 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: s
         raise SettingError(f"the floor draws the future of a demand of ours: leave --floor out for {flags['case']!r}")
     with_floor = not own if with_floor is None else with_floor
     base = _base(flags) | ({} if flags["calibration"] is None else {"calibration": flags["calibration"]})
-    demands = _numbers("demand", demand or ("1.0" if own else "0.6,1.0,1.3"))
+    demands = numbers("demand", demand or ("1.0" if own else "0.6,1.0,1.3"))
     seeds = campaign.seeds(f"1-{_whole('seeds', flags['seeds'])}")
     horizon, step_s = _whole("horizon", flags["horizon"]), _step_s(flags)
     folder = recording.new_folder(out, f"mismatch-{Path(base['net']).name.partition('.')[0]}-{flags['controller']}")
@@ -181,7 +182,7 @@ def calibrate(out: Path, demand: str | None, seeds: str, **flags: Any) -> None:
     """
     from utn_sumo import campaign, recording, report, study  # noqa: PLC0415 - heavy
 
-    demands = _numbers("demand", demand or ("0.7,0.9,1.1,1.25" if flags["case"] is None else "1.0"))
+    demands = numbers("demand", demand or ("0.7,0.9,1.1,1.25" if flags["case"] is None else "1.0"))
     seed_list = campaign.seeds(seeds)
     base = _base(flags) | {"calibration": "none"}
     folder = recording.new_folder(out, "calibration")
@@ -208,7 +209,7 @@ def paper(out: Path | None, as_json: bool, in_sumo: bool, demand: str, **flags: 
     from utn_sumo import paper as comparison  # noqa: PLC0415 - heavy
     from utn_sumo import recording, report  # noqa: PLC0415 - heavy
 
-    runs = comparison.runs(_numbers("demand", demand), in_sumo=in_sumo, **flags)
+    runs = comparison.runs(numbers("demand", demand), in_sumo=in_sumo, **flags)
     folder = recording.new_folder(out, f"paper-seed{flags['seed']}")
     with report.counter("runs", len(runs)) as tick:
         results = comparison.study(runs, folder, tick)
@@ -241,7 +242,7 @@ def tune(
 
     tuning.library()
     space = search_space.space(controller, over, execution)
-    demands = None if flags["demands"] is None else _numbers("demands", flags["demands"])
+    demands = None if flags["demands"] is None else numbers("demands", flags["demands"])
     bases = tuning.bases(flags["nets"].split(","), demands, flags["hours"])
     task = tuning.Task(controller, space, bases, campaign.seeds(flags["seeds"]), execution)
     task.check()
@@ -363,13 +364,13 @@ def _step_s(flags: dict[str, Any]) -> float | None:
     """The model step that is asked for, if any is. Raises SettingError."""
     if flags["step"] is None:
         return None
-    step_s, *more = _numbers("step", flags["step"])
+    step_s, *more = numbers("step", flags["step"])
     if more:
         raise SettingError(f"setting 'step' is {flags['step']!r}: it must be one number")
     return step_s
 
 
-def _numbers(name: str, text: str) -> list[float]:
+def numbers(name: str, text: str) -> list[float]:
     """Numbers separated by commas, each once. Raises SettingError."""
     try:
         found = [float(word) for word in text.split(",")]
@@ -398,23 +399,31 @@ def _number(text: str | None) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point: every error that is the user's to mend is one line and exit code 2; 130 after Ctrl-C."""
-    try:
+    """Entry point."""
+    with told("utn", "what was reached is on disk"):
         cli.main(args=arguments, prog_name="utn", standalone_mode=False)
+
+
+@contextmanager
+def told(program: str, after_stop: str) -> Iterator[None]:
+    """Every error that is the user's to mend is one line and exit code 2; 130 after Ctrl-C, and what is left of it."""
+    try:
+        yield
     except UtnError as error:
-        _fail(str(error))
+        _fail(program, str(error))
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
     except click.UsageError as error:
-        _fail(f"{error.format_message().rstrip('.')}: see utn --help")
+        _fail(program, f"{error.format_message().rstrip('.')}: see {program} --help")
     except (click.exceptions.Abort, KeyboardInterrupt):
-        click.echo("utn: stopped; what was reached is on disk", err=True)
+        click.echo(f"{program}: stopped; {after_stop}", err=True)
         sys.exit(130)
     except OSError as error:
         # Of files that are ours to read all errors are told where they are read: this is a disk, or a pipe's end.
-        _fail(f"{str(error.filename or 'output')!r} can't be used ({error.strerror}): free it, or name another")
+        what = str(error.filename or "output")
+        _fail(program, f"{what!r} can't be used ({error.strerror}): free it, or name another")
 
 
-def _fail(line: str) -> None:
-    click.echo(f"utn: {line}", err=True)
+def _fail(program: str, line: str) -> None:
+    click.echo(f"{program}: {line}", err=True)
     sys.exit(2)

@@ -35,8 +35,8 @@ SETTINGS, CYCLES, RESULT = "settings.json", "cycles.jsonl", "result.json"
 NET, ROUTES, PROGRAMMES = "net.net.xml", "routes.rou.xml", "programmes.add.xml"
 
 
-def new_folder(path: Path | None, default_name: str) -> Path:
-    """Make and return the folder for a run's results; `results/<default name>[-n]` if none is named.
+def new_folder(path: Path | None, default_name: str, flag: str = "--out") -> Path:
+    """Make and return the folder for a run's results; `results/<default name>[-n]` if `flag` names none.
 
     Raises ResultError if the named folder holds anything, since nothing is ever overwritten, or can't be written to.
     """
@@ -47,15 +47,15 @@ def new_folder(path: Path | None, default_name: str) -> Path:
             raise ResultError(f"output folder {str(path)!r} has {taken}: name another")
     try:
         if path.exists() and not path.is_dir():
-            raise ResultError(f"output folder {str(path)!r} is a file: name another with --out")
+            raise ResultError(f"output folder {str(path)!r} is a file: name another with {flag}")
         if path.is_dir() and any(path.iterdir()):
-            raise ResultError(f"output folder {str(path)!r} is not empty: name another with --out")
+            raise ResultError(f"output folder {str(path)!r} is not empty: name another with {flag}")
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             return path
     except OSError as error:
         raise ResultError(
-            f"output folder {str(path)!r} can't be written to ({error.strerror}): name another with --out"
+            f"output folder {str(path)!r} can't be written to ({error.strerror}): name another with {flag}"
         ) from error
 
 

@@ -42,7 +42,7 @@ def test_a_ctrl_c_while_the_first_process_still_imports_is_silent_there(tmp_path
 
 @pytest.mark.parametrize("text", ["2147483648", "1-99999999999", "9" * 5000])
 def test_seeds_that_sumo_does_not_take_are_refused_by_name(text: str) -> None:
-    with pytest.raises(UtnError, match="'seeds' is .*up to 2147483647"):
+    with pytest.raises(UtnError, match=r"'seeds' is .*up to 2147483647"):
         campaign.seeds(text)
 
 
