@@ -45,6 +45,15 @@ UNKNOWN_VEH = 1.0
 LONGEST_RUN_S = 240 * 3600.0
 """As long as the longest run that a scenario may ask for: for one whose end nobody knows."""
 
+OURS = {
+    "execution": "plans nothing that could be carried out",
+    "calibration": "has no model",
+    "loop_error": "has no loops that could miscount",
+    "forecast": "looks at no forecast",
+    "refit_steps": "looks at no forecast",
+}
+"""Settings that only our own controllers go by, and why SUMO's do not."""
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -202,24 +211,27 @@ def _predictor(net: Network, scenario: Scenario, driving: Path | Case, steps: in
 
 
 def check_execution(scenario: Scenario) -> None:
-    """Raise SettingError for what only our own controllers take beside signals that SUMO switches itself: an execution,
-    a calibration, and under `native` any setting.
+    """Raise SettingError for settings that nobody would go by: of a controller's own execution beside another one,
+    `OURS` beside signals that SUMO switches itself, and under `native` any.
     """
-    if scenario.controller not in sumo_signals.RUNS:
+    who, settings = scenario.controller, scenario.controller_settings
+    if who not in sumo_signals.RUNS:
+        if scenario.execution is not None and settings and controllers.takes_those_of_execution(who):
+            name, value = next(iter(settings.items()))
+            raise SettingError(
+                f"setting {name!r} is {value!r}: it goes with the execution that controller {who!r} has itself, and "
+                f"beside {scenario.execution!r} nobody takes it: leave one of the two out"
+            )
         return
-    if scenario.execution is not None:
-        raise SettingError(
-            f"setting 'execution' is {scenario.execution!r}: controller {scenario.controller!r} plans nothing that "
-            "could be carried out, SUMO switches its signals: leave it out"
-        )
-    if scenario.calibration not in {None, "none"}:
-        raise SettingError(
-            f"setting 'calibration' is {scenario.calibration!r}: controller {scenario.controller!r} has no model, "
-            "SUMO switches its signals: leave it out"
-        )
-    if scenario.controller == native.NAME and scenario.settings:
+    for name, why in OURS.items():
+        value = getattr(scenario, name)
+        if value != Scenario.model_fields[name].default and (name, value) != ("calibration", "none"):
+            raise SettingError(
+                f"setting {name!r} is {value!r}: controller {who!r} {why}, SUMO switches its signals: leave it out"
+            )
+    if who == native.NAME and scenario.settings:
         name = next(iter(scenario.settings))
-        raise SettingError(f"controller {scenario.controller!r} has no setting {name!r}: it takes none")
+        raise SettingError(f"controller {who!r} has no setting {name!r}: it takes none")
 
 
 class _Tally:

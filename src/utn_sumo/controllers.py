@@ -133,6 +133,16 @@ def settings_of(factory: Any) -> list[str]:
     return [word for word in inspect.signature(factory).parameters if word != "network"]
 
 
+def takes_those_of_execution(name: str) -> bool:
+    """Whether the settings of the controller called `name` are those of an execution, which it brings itself.
+
+    Raises ControllerError.
+    """
+    model = getattr(maker(name), "Settings", None)
+    theirs = (getattr(maker(each, EXECUTION), "Settings", None) for each in registered(EXECUTION))
+    return model is not None and any(model is each for each in theirs)
+
+
 def _registered(kind: Kind, name: str) -> Any:
     points = registered(kind)
     if name not in points:

@@ -125,6 +125,8 @@ def space(controller: str, over: Sequence[str] = (), execution: str | None = Non
     an execution likewise, as `execution.name`. Raises UtnError.
     """
     whose = f"controller {controller!r}"
+    if controller in CONTROLLER.others:
+        raise SettingError(f"{whose} takes no settings: there is nothing to tune, name another")
     models = _model(CONTROLLER, controller, "")
     if execution is not None and execution != EXACT:
         whose += f" with execution {execution!r}"
@@ -144,11 +146,13 @@ def space(controller: str, over: Sequence[str] = (), execution: str | None = Non
                 f"say where to search, as in --over {next(iter(fields))}=1:10"
             )
         return Space(models, bounded)
-    searched = {}
+    searched: dict[str, Range | Choice] = {}
     for text in over:
         name, equals, where = (word.strip() for word in text.partition("="))
         if name not in fields:
             raise SettingError(f"{whose} has no setting {name!r}: {did_you_mean(name, fields)}")
+        if name in searched:
+            raise SettingError(f"--over {text!r}: {name!r} is there already, say once where to search it")
         found = _said(text, fields[name], where) if equals else _own(fields[name])
         if found is None:
             raise SettingError(f"--over {text!r}: it has no bounds of its own, write {name}=low:high or {name}=a,b,c")

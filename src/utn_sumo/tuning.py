@@ -87,9 +87,10 @@ class Task:
 
     def check(self) -> None:
         """Raises UtnError for a scenario that can't be."""
+        settings = nested(self.space.defaults)
         for base in self.bases:
             for seed in self.seeds:
-                bridge.check_execution(scenario(**base, **self.who, seed=seed))
+                bridge.check_execution(scenario(**base, **self.who, settings=settings, seed=seed))
 
     def runs(self, start: Start, settings: Settings, seed: int) -> list[Future[dict[str, Any]]]:
         """A run of every scenario with a seed."""

@@ -192,6 +192,9 @@ def test_commas_in_paths_are_refused(broken: Path, capsys: pytest.CaptureFixture
         ("native", ["--set", "foo=1"], "'native' has no setting 'foo': it takes none"),
         ("native", ["--calibration", "nowhere.json"], "'calibration' is 'nowhere.json': .*leave it out"),
         ("actuated", ["--calibration", "nowhere.json"], "'calibration' is 'nowhere.json': .*leave it out"),
+        ("actuated", ["--loop-error", "0.02"], "'loop_error' is 0.02: .*leave it out"),
+        ("webster", ["--forecast", "profile"], "'forecast' is 'profile': .*leave it out"),
+        ("native", ["--refit-steps", "3"], "'refit_steps' is 3: .*leave it out"),
     ],
 )
 def test_what_sumo_s_own_signals_do_not_take_is_refused(
@@ -199,3 +202,18 @@ def test_what_sumo_s_own_signals_do_not_take_is_refused(
 ) -> None:
     assert re.search(says, line(["run", "town.sumocfg", "--controller", controller, "--out", "out", *more], capsys))
     assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("controller", ["fixed", "native", "actuated"])
+def test_where_sumo_breaks_off_its_own_clock_says_when(
+    broken: Path, capsys: pytest.CaptureFixture[str], controller: str
+) -> None:
+    # Of routes SUMO reads two hundred seconds ahead: so it has begun.
+    late = '<route edges="1 10"/></vehicle><vehicle id="w" depart="707" departLane="7"><route edges="1 10"/></vehicle>'
+    edit("town.rou.xml", '<route edges="1 10"/></vehicle>', late)(broken)
+    edit("town.rou.xml", 'depart="1"', 'depart="301"')(broken)
+    edit("town.sumocfg", '<begin value="0"/><end value="60"/>', '<begin value="300"/><end value="900"/>')(broken)
+    arguments = ["run", "town.sumocfg", "--controller", controller, "--out", "out"]
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert "SUMO broke off at 707 s of its time (" in capsys.readouterr().err

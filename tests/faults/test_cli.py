@@ -98,6 +98,11 @@ MISTAKES: dict[str, tuple[tuple[str, ...], str, str]] = {
         "'execution' is 'actuated'",
         "leave it out",
     ),
+    "tuning what does not run": (
+        ("tune", "recommended", "--execution", "exact"),
+        "'recommended'",
+        "leave one of the two",
+    ),
     "tuning on an unknown net": (("tune", "max_wave", "--nets", "utn71"), "'utn71'", "did you mean 'utn17"),
     "tuning with seeds in letters": (("tune", "max_wave", "--seeds", "a-b"), "'seeds' is 'a-b'", "as in 1-3,7"),
     "seeds that are no numbers": (("calibrate", "--seeds", "nan", "--out", "new"), "'seeds' is 'nan'", "as in 1-3,7"),

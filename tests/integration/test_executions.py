@@ -149,6 +149,16 @@ def test_an_execution_is_asked_every_time_whether_a_junction_is_free_or_none(
         ({"settings": {"execution": {"gap_s": 2}}}, SettingError, "name the execution that takes it"),
         ({"controller": "actuated", "execution": "exact"}, SettingError, "leave it out"),
         ({"controller": "native", "execution": "priced"}, SettingError, "leave it out"),
+        (
+            {"controller": "recommended", "execution": "exact", "settings": {"horizon_s": 60}},
+            SettingError,
+            "'horizon_s' is 60: it goes with the execution that controller 'recommended' has itself",
+        ),
+        (
+            {"controller": "max_pressure", "execution": "scheduled", "settings": {"every_s": 7}},
+            SettingError,
+            "beside 'scheduled' nobody takes it: leave one of the two out",
+        ),
     ],
 )
 def test_a_mistake_is_named_and_leaves_nothing_behind(
@@ -161,6 +171,11 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(
     assert complaint in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+def test_what_a_file_for_all_controllers_says_as_it_is_without_is_no_mistake_beside_sumo_s_own_signals() -> None:
+    usual = {"calibration": "none", "loop_error": 0, "forecast": "starima", "refit_steps": 15}
+    bridge.check_execution(scenario(controller="actuated", **usual))
 
 
 class Counting:

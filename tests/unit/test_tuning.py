@@ -116,6 +116,8 @@ def test_where_no_number_has_both_bounds_all_choices_are_searched() -> None:
     ("controller", "over", "named"),
     [
         ("max_wav", (), "did you mean 'max_wave'"),
+        ("native", (), "controller 'native' takes no settings"),
+        ("actuated", ("max_gap_s=1:2", "max_gap_s=2:3"), "--over 'max_gap_s=2:3': 'max_gap_s' is there already"),
         ("fixed", (), "has no settings that say what they may be"),
         ("dmpc", ("execution.gap_s=1:3",), "has no setting 'execution.gap_s'"),
         ("max_wave", ("evry_s=1:2",), "did you mean 'every_s'"),

@@ -18,7 +18,7 @@ from typing import Any, Self
 import numpy as np
 
 from utn_sumo import detectors
-from utn_sumo.case import Case
+from utn_sumo.case import Case, in_digits
 from utn_sumo.contract import (
     AREA_REACH_M,
     SAMPLE_S,
@@ -222,9 +222,7 @@ class SumoPlant:
             )
             return self._measure()
         except (self._sumo.TraCIException, self._sumo.FatalTraCIError) as error:
-            raise PlantError(
-                f"SUMO broke off at {self.time_s:g} s ({first_line(error)}): mend the scenario, see {self.folder / LOG}"
-            ) from error
+            raise broken_off(self._sumo, error, self.folder / LOG) from error
 
     def redraw(self, onward: Callable[[int], list[str]], rng: np.random.Generator, speed_share: float) -> None:
         """Give every vehicle on the road a new future: another way, and a slightly other speed.
@@ -420,6 +418,12 @@ def records(folder: Path, seed: int) -> list[str]:
         "--no-warnings",
         "--error-log", str(folder / LOG),
     ]  # fmt: skip
+
+
+def broken_off(sumo: Any, error: Exception, log: Path) -> PlantError:
+    """What to raise for an error amid a run of `sumo`, the module libsumo."""
+    time_s = in_digits(sumo.simulation.getTime())
+    return PlantError(f"SUMO broke off at {time_s} s of its time ({first_line(error)}): mend the scenario, see {log}")
 
 
 def first_line(error: Exception) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from utn_sumo.errors import PlantError
-from utn_sumo.plant.sumo import SumoPlant, first_line
+from utn_sumo.plant.sumo import SumoPlant, broken_off, first_line
 
 LOOK_S = 10.0
 """Time between two looks at how full the roads are."""
@@ -79,9 +79,7 @@ def run(
             present_veh_s += LOOK_S * (on_road + len(libsumo.simulation.getPendingVehicles()))
             on_look(Look(now_s, on_road, sum(halting), present_veh_s / 3600))
     except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-        raise PlantError(
-            f"SUMO broke off at {now_s:g} s ({first_line(error)}): mend the scenario, see {log}"
-        ) from error
+        raise broken_off(libsumo, error, log) from error
     except KeyboardInterrupt:
         interrupted = True
     finally:
