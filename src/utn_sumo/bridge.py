@@ -137,7 +137,7 @@ def run(
             recorder.close()
     verdict = monitor.watch(net, folder / "signals.xml", plant.time_s, plant.begin_s, in_order=execution is None)
     greens = metrics.Greens(net, folder / "signals.xml", plant.time_s, plant.begin_s)
-    trips = metrics.trip_measures(folder / "trips.xml")
+    trips = metrics.trip_measures(folder / "trips.xml", chosen.called if chosen else (), plant.begin_s + plant.time_s)
     elapsed_s = time.perf_counter() - started
     result = {
         "controller": scenario.controller,

@@ -70,6 +70,8 @@ class Case:
     """Whatever else it says of SUMO's options, as (name, value); files among them as paths that hold from here."""
     seeds: tuple[tuple[str, str], ...] = ()
     """What it says of chance, likewise: a run of ours has a seed of its own."""
+    called: frozenset[str] = frozenset()
+    """Vehicles that depart when somebody calls for them, by id; none as long as nobody has read its routes."""
 
     @property
     def step_s(self) -> float:

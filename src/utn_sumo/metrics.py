@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET  # only for the files that our own SUMO has just written
@@ -13,13 +14,19 @@ from utn_sumo import monitor
 from utn_sumo.contract import Bools, Floats, Network
 from utn_sumo.errors import ResultError
 
+HUNDREDTH_S = 0.01
+"""To which SUMO writes times."""
 
-def trip_measures(trips: Path) -> dict[str, Any]:
+
+def trip_measures(trips: Path, called: Collection[str] = (), end_s: float = math.inf) -> dict[str, Any]:
     """Sums over every vehicle that wanted to travel, whether it arrived, was under way or still waited to enter.
 
     `total_time_spent_veh_h` is time on the road and time waiting to enter; `total_delay_veh_h` is SUMO's time
     loss plus that wait, `mean_delay_s` the same a vehicle; `mean_travel_time_s` is entry to arrival
     with the wait before it, over the vehicles that arrived; `stops` counts halts.
+
+    Of the vehicles that somebody has to call for (`called`, by id), those are left out whom nobody had called when the
+    run ended, at SUMO's time `end_s`: they did not want to travel, and by SUMO's record wait since its time 0.
     """
     spent = delay = travel = 0.0
     vehicles = arrived = stops = 0
@@ -27,8 +34,12 @@ def trip_measures(trips: Path) -> dict[str, Any]:
         for _, trip in ET.iterparse(trips):
             if trip.tag != "tripinfo":
                 continue
-            vehicles += 1
             wait_s, road_s = float(trip.attrib["departDelay"]), float(trip.attrib["duration"])
+            never_called = float(trip.attrib["depart"]) < 0 and wait_s >= end_s - HUNDREDTH_S
+            # Where traffic is scaled up, copies of a vehicle have its id and a number.
+            if never_called and (trip.attrib["id"] in called or trip.attrib["id"].rpartition(".")[0] in called):
+                continue
+            vehicles += 1
             spent += wait_s + road_s
             delay += wait_s + float(trip.attrib["timeLoss"])
             stops += int(trip.attrib["waitingCount"])

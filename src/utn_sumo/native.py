@@ -88,7 +88,7 @@ def measured(
         "demand": scenario.demand,
         "seed": scenario.seed,
         "hours": (outcome.end_s - chosen.begin_s) / 3600,
-        **metrics.trip_measures(folder / "trips.xml"),
+        **metrics.trip_measures(folder / "trips.xml", chosen.called, outcome.end_s),
         "max_queue_veh": outcome.max_queue_veh,
         "max_vehicles_veh": outcome.max_vehicles_veh,
         "over_storage_veh": None,

@@ -60,6 +60,8 @@ DAY_S = 86400.0
 """How long SUMO lets a flow last that has no end, where the window has none either."""
 WHENEVER = frozenset({"triggered", "containerTriggered", "split", "begin", "now"})
 """Departures that are no time: they are taken to be within the window."""
+CALLED = WHENEVER - {"begin"}
+"""Those that somebody has to call for: a person, a container, a train, a programme."""
 ROUNDING_VEH = 1e-6
 """What the times of a flow's departures are uncertain by, in vehicles."""
 DRIVES, WAYS = frozenset({"vehicle", "trip", "flow"}), frozenset({"route", "routeDistribution"})
@@ -121,6 +123,7 @@ class _Reader:
         self.turned_veh: defaultdict[tuple[str, str], float] = defaultdict(float)
         self.trips_veh: defaultdict[tuple[str, ...], float] = defaultdict(float)
         self.named_by: dict[str, str] = {}
+        self.called: set[str] = set()
         self.by_route: dict[str, tuple[float, str]] = {}
         """Vehicles on a named route, and who names it first."""
         self.by_type: dict[str, tuple[float, str]] = {}
@@ -162,6 +165,7 @@ class _Reader:
             trips_veh=dict(self.trips_veh),
             shortest_m=shortest_m,
             named_by=self.named_by,
+            called=frozenset(self.called),
         )
 
     def _ride(self, element: Element) -> None:
@@ -198,6 +202,8 @@ class _Reader:
 
     def _departs(self, element: Element) -> bool:
         if element.get("depart") in WHENEVER:
+            if element.get("depart") in CALLED:
+                self.called.add(element.get("id", ""))
             return True
         return self.begin_s <= self._time_s(element, "depart", None) < self.end_s
 

@@ -44,5 +44,6 @@ def given(scenario: Scenario) -> Case:
     if scenario.demand != 1:
         options["scale"] = f"{scenario.demand * found.scale:g}"
     chosen = replace(found, end_s=end_s, options=tuple(options.items()))
-    routes.check(chosen, routes.read(chosen))
-    return chosen
+    coming = routes.read(chosen)
+    routes.check(chosen, coming)
+    return replace(chosen, called=coming.called)

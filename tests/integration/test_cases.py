@@ -346,3 +346,31 @@ def test_what_its_additional_files_would_write_goes_nowhere(town: Path, tmp_path
         before.add(controller)
         assert {path.name for path in tmp_path.iterdir()} == before
     assert trips(tmp_path / "native" / "trips.xml") == by_bare_sumo(town, tmp_path, 9)
+
+
+@pytest.mark.parametrize("controller", ["native", "fixed"])
+@pytest.mark.parametrize("begin_s", [0, 7200])
+def test_who_was_never_called_for_is_not_late_but_who_was_and_finds_no_room_is(
+    controller: str, begin_s: int, tmp_path: Path
+) -> None:
+    odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    calls_s, end_s = begin_s + 150, begin_s + 200
+    way = '<route edges="{} {}"/>'
+    ours = {"taxi": ("W-C", "C-E"), "rank": ("sC-C", "C-nC"), "rank2": ("sC-C", "C-nC")}
+    cars = "".join(
+        f'<vehicle id="{name}" depart="triggered">{way.format(*edges)}</vehicle>' for name, edges in ours.items()
+    )
+    ride = f'<person id="rider" depart="{calls_s}"><ride from="W-C" to="C-E" lines="taxi"/></person>'
+    # So many that the taxi is called onto a road without room.
+    jam = odd_nets.flow("jam", "W-C", "C-E", period=0.5, begin=begin_s, end=end_s)
+    (tmp_path / "own.add.xml").write_text(f"<additional>{cars}{ride}</additional>", encoding="utf-8")
+    options = {"additional-files": "own.add.xml", "scale": "2"}
+    file = odd_nets.case(tmp_path, jam, options=options, begin=str(begin_s), end=str(end_s))
+    result = bridge.run(scenario(net=str(file), controller=controller), tmp_path / "run")
+    recorded = trips(tmp_path / "run" / "trips.xml")
+    assert {"rank", "rank.1", "rank2", "rank2.1"} < set(recorded)
+    assert recorded["taxi"][:2] == ("-1", "50.00")
+    late = [trip for name, trip in recorded.items() if not name.startswith("rank") and name != "taxi.1"]
+    assert result["arrived"] + result["unfinished"] == len(late)
+    delay_s = sum(float(departure) + float(loss) for _, departure, _, loss, _, _ in late)
+    assert result["total_delay_veh_h"] == pytest.approx(delay_s / 3600)

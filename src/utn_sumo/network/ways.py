@@ -42,6 +42,8 @@ class Traffic:
     """Length of the shortest vehicle that drives on a road; a passenger car's where none is shorter."""
     named_by: Mapping[str, str]
     """Edges on their ways, as far as these are known, and who names each of them first."""
+    called: frozenset[str] = frozenset()
+    """Vehicles that depart when somebody calls for them, by id."""
 
     @property
     def without_route_veh(self) -> float:
