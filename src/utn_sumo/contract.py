@@ -671,7 +671,10 @@ class Plan:
 
 
 class View(Protocol):
-    """What is to be seen at one moment, for decisions within the cycle. Detectors are read when they are asked for."""
+    """What is to be seen at one moment, for decisions within the cycle. Detectors are read when they are asked for.
+
+    Its arrays are the execution's own to write into, which changes nothing on the road.
+    """
 
     @property
     def time_s(self) -> float: ...

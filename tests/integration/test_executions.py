@@ -54,6 +54,41 @@ class Wavers(Counts):
         self.every_s = 1 + self.due_s % 4
         return super().wish(view)
 
+class Turns(Keeps):
+    def __init__(self, network):
+        super().__init__(network)
+        self.after = {s: j.stages[(k + 1) % len(j.stages)] for j in network.junctions for k, s in enumerate(j.stages)}
+    def wish(self, view):
+        stage = self.taken(view)
+        for index in view.free.nonzero()[0]:
+            if view.time_s - view.begin_s[index] >= 15:
+                stage[index] = self.after[int(stage[index])]
+        return stage
+    def taken(self, view):
+        return view.stage.copy()
+
+class Scribbles(Turns):
+    def taken(self, view):
+        for seen in (view.set_waiting_veh, view.waiting_veh, view.near_veh, view.calling):
+            seen[:] = 0
+        for seen in (view.x_veh, view.entered_veh, view.left_veh):
+            seen[:] = 1000
+        return view.stage
+    def wish(self, view):
+        stage = super().wish(view)
+        view.free[:], view.begin_s[:] = True, 0
+        return stage
+
+class Muddles(Keeps):
+    def wish(self, view):
+        view.stage[:] = (view.stage + 1) % 4
+        return view.stage
+
+class CountsBack(Keeps):
+    def wish(self, view):
+        view.stage[-1] = -1
+        return view.stage
+
 class Hasty(Keeps):
     def __init__(self, network):
         self.every_s = 0
@@ -114,7 +149,15 @@ def test_greens_that_end_early_save_delay_and_keep_the_order_of_stages(run_of: R
         assert np.mean(in_order) > 0.5
 
 
-@pytest.mark.parametrize(("name", "why"), [("Raises", "not today"), ("Strays", "no stage for each junction")])
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("Raises", "not today"),
+        ("Strays", "no stage for each junction"),
+        ("Muddles", "no stage for each junction"),
+        ("CountsBack", "no stage for each junction"),
+    ],
+)
 def test_an_execution_that_fails_is_written_down_and_everybody_still_gets_green(
     own: str, name: str, why: str, tmp_path: Path
 ) -> None:
@@ -124,6 +167,19 @@ def test_an_execution_that_fails_is_written_down_and_everybody_still_gets_green(
     assert why in result["fallback_reasons"][0]
     assert result["unsafe_signal_s"] == 0
     assert result["arrived"] > 50
+
+
+def test_what_an_execution_writes_into_what_it_sees_is_its_wish_alone(own: str, tmp_path: Path) -> None:
+    copied, written = (
+        bridge.run(scenario(controller="fixed", execution=f"{own}:{name}", hours=0.2), tmp_path / name)
+        for name in ("Turns", "Scribbles")
+    )
+    assert written["fallback_reasons"] == []
+    assert written["longest_red_s"] == copied["longest_red_s"] <= 180
+    assert written["total_delay_veh_h"] == copied["total_delay_veh_h"]
+    shown = [monitor.read_switches(tmp_path / name / "signals.xml") for name in ("Turns", "Scribbles")]
+    assert shown[0] == shown[1]
+    assert all(len(switches) > 50 for switches in shown[0].values())
 
 
 @pytest.mark.parametrize("name", ["Counts", "Wavers"])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.integration import odd_nets
-from tests.unit.views import scene
+from tests.unit.views import allowed, scene
 from utn_controllers.actuated import Actuated
 from utn_controllers.scheduled.calling import Calling
 from utn_controllers.scheduled.execution import Scheduled
@@ -88,7 +88,7 @@ def test_who_calls_is_served_before_he_waits_too_long_and_who_does_not_call_is_n
         for time_s in np.arange(0, MOST_PATIENCE_S + LOOK_S, LOOK_S):
             calling = np.where(np.arange(len(network.callers)) == who, pressed, 0.0)
             now = replace(scene(network, float(time_s)), calling=calling)
-            led_on = patience.allow(now.stage, now)[0] != first
+            led_on = allowed(patience, now.stage, now)[0] != first
             assert led_on == bool(pressed and time_s >= MOST_PATIENCE_S)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.integration import odd_nets
-from tests.unit.views import scene
+from tests.unit.views import allowed, scene
 from utn_sumo.contract import Network
 from utn_sumo.plant.heads import Heads
 from utn_sumo.plant.inside import MOST_HOLD_S, Inside
@@ -140,7 +140,7 @@ def test_where_reds_may_be_drawn_out_who_waits_is_served_sooner(crossing: Crossi
     for areas in (None, crossing.traffic):
         heads = Heads(slow, lambda index, letters: None, areas)
         for time_s in np.arange(0.0, LONGEST_RED_S, LOOK_S):
-            if heads.patience.allow(wish, scene(slow, float(time_s), veh=1.0)) != wish:
+            if allowed(heads.patience, wish, scene(slow, float(time_s), veh=1.0)) != wish:
                 waited_s.append(time_s)
                 break
     # There and back.

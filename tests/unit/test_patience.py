@@ -12,7 +12,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.integration import odd_nets
-from tests.unit.views import scene
+from tests.unit.views import allowed, scene
 from utn_sumo.contract import Floats, Network
 from utn_sumo.plant.heads import Heads
 from utn_sumo.plant.patience import LONGEST_RED_S, LOOK_S, MOST_PATIENCE_S, PAUSE_S, STARTING_S, Patience, longest_red_s
@@ -30,7 +30,7 @@ def test_who_waits_too_long_comes_next_and_who_does_not_wait_does_not(utn17: Net
         patience = Patience(utn17, no_holds(utn17))
         for time_s in np.arange(0, MOST_PATIENCE_S + 5, 5):
             now = scene(utn17, float(time_s), veh=waiting)
-            kept = patience.allow(now.stage, now)
+            kept = allowed(patience, now.stage, now)
             if time_s < MOST_PATIENCE_S - 1:
                 assert (kept == now.stage).all()
         assert (kept != now.stage).all() == forced
@@ -42,7 +42,7 @@ def test_who_creeps_on_for_a_moment_waits_still_and_who_has_gone_does_not(utn17:
         for time_s in np.arange(0, MOST_PATIENCE_S + LOOK_S, LOOK_S):
             stands = not 60 <= time_s < 60 + unseen_s
             now = scene(utn17, float(time_s), veh=float(stands))
-            kept = patience.allow(now.stage, now)
+            kept = allowed(patience, now.stage, now)
         assert (kept != now.stage).all() == forced
 
 
@@ -58,7 +58,7 @@ def test_who_has_had_green_in_one_stage_does_not_call_for_another(utn17: Network
         # The last stage, which serves the second's traffic too, has been shown meanwhile.
         present[0] = last if time_s == 100 else first
         now = scene(net, float(time_s), present, veh=1.0)
-        kept = patience.allow(now.stage, now)[0]
+        kept = allowed(patience, now.stage, now)[0]
         assert (kept == last) == (time_s == 100 or time_s >= 100 + MOST_PATIENCE_S)
 
 
@@ -71,7 +71,7 @@ def test_where_green_and_clearance_are_long_who_waits_comes_sooner(utn17: Networ
     sooner_s = LONGEST_RED_S - LOOK_S - 45.0 - 2 * utn17.stages[junction.stages[0]].clearance_s
     for time_s in np.arange(0, sooner_s + LOOK_S, LOOK_S):
         now = scene(utn17, float(time_s), veh=1.0)
-        kept = patience.allow(now.stage, now)
+        kept = allowed(patience, now.stage, now)
         assert (kept != now.stage)[0] == (time_s > sooner_s)
         assert (kept == now.stage)[1:].all()
 
@@ -124,9 +124,9 @@ def test_whatever_is_wished_nobody_waits_longer_than_the_longest_red(
         heads.advance(now)
         if now % every_s == 0 and heads.free(now)[0]:
             wish = np.array([rng.integers(4)]) if rng.random() < keenness else heads.stage
-            allowed = heads.patience.allow(wish, scene(network, now, heads.stage, veh=1.0))
-            if allowed[0] != heads.stage[0]:
-                heads.switch(0, int(allowed[0]), now)
+            kept = allowed(heads.patience, wish, scene(network, now, heads.stage, veh=1.0))
+            if kept[0] != heads.stage[0]:
+                heads.switch(0, int(kept[0]), now)
         if now >= heads.begin_s[0]:
             last_green_s[network.serves[heads.stage[0]]] = now
         # By decisions every few seconds it may come a little later than is aimed at.
@@ -148,7 +148,7 @@ def test_one_who_waits_alone_is_not_served_sooner_for_stages_that_nobody_needs(f
     view = scene(network, 0.0)
     for time_s in np.arange(0.0, MOST_PATIENCE_S + LOOK_S, LOOK_S):
         now = replace(view, time_s=float(time_s), set_waiting_veh=veh.astype(float))
-        assert (patience.allow(now.stage, now)[0] != now.stage[0]) == (time_s >= MOST_PATIENCE_S)
+        assert (allowed(patience, now.stage, now)[0] != now.stage[0]) == (time_s >= MOST_PATIENCE_S)
 
 
 def test_a_junction_does_not_go_where_it_could_not_be_back_from_in_time(four_stages: Network) -> None:
@@ -161,8 +161,8 @@ def test_a_junction_does_not_go_where_it_could_not_be_back_from_in_time(four_sta
     refused_s = []
     for time_s in np.arange(0.0, MOST_PATIENCE_S, LOOK_S):
         now = replace(view, time_s=float(time_s), set_waiting_veh=veh)
-        assert (patience.allow(now.stage, now) == now.stage).all()
-        if patience.allow(np.array([long]), now)[0] != long:
+        assert (allowed(patience, now.stage, now) == now.stage).all()
+        if allowed(patience, np.array([long]), now)[0] != long:
             refused_s.append(time_s)
     clears_s = network.clearance_s[0] + network.clearance_s[long]
     assert refused_s[0] == pytest.approx(LONGEST_RED_S - LOOK_S - 40.0 - clears_s, abs=LOOK_S)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from utn_sumo.contract import CLOSE_ZONES, ZONES_M, Bools, Floats, Ints, Network
+from utn_sumo.plant.patience import Patience
 
 
 @dataclass(frozen=True)
@@ -81,3 +82,9 @@ def scene(
         network.link_junction,
         np.zeros(len(network.callers)),
     )
+
+
+def allowed(patience: Patience, wish: Ints, now: Scene) -> Ints:
+    """(J,) what patience makes of a wish at this moment."""
+    patience.look(now)
+    return patience.allow(wish, now.stage, now.time_s)

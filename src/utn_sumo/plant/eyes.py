@@ -130,7 +130,8 @@ class Eyes:
         (Z,) vehicles on each link, (Z,) that have come onto it and (L,) left over stop lines since the run began.
         """
         if time_s % self._step_s == 0:
-            return np.maximum(self._x_veh, 0.0), self._entered_veh, self._left_veh
+            # What is counted on from is never handed out: a foreign execution may write into it.
+            return np.maximum(self._x_veh, 0.0), self._entered_veh.copy(), self._left_veh.copy()
         came, left = self._entries.read(self._counted), self._exits.read(self._counted)
         counted: tuple[Floats, Floats, Floats] = _counted(
             came, left, self._x_veh, self._entered_veh, self._left_veh, self._set_link
@@ -247,7 +248,7 @@ class Sight:
         self.time_s = time_s
         self.stage = heads.stage.copy()
         self.begin_s = heads.begin_s.copy()
-        self.free = free
+        self.free = free.copy()
         self.near_one_veh = eyes.near_one_veh
         self.close_one_veh = eyes.close_one_veh
         self.gap_one_s = eyes.gap_one_s

@@ -67,21 +67,25 @@ class Patience:
         """By junction whose time may come the stage to serve first, and when it has to be led to at the latest."""
         self._warm_up(network)
 
-    def allow(self, wish: Ints, view: View) -> Ints:
-        """(J,) the wish, but where somebody would have to wait for too long then: whom first, is served next."""
-        if view.time_s >= self._look_s:
-            self._look(view)
-            self._look_s = view.time_s + LOOK_S
+    def allow(self, wish: Ints, stage: Ints, now_s: float) -> Ints:
+        """(J,) the wish, but where somebody would have to wait for too long then: whom first, is served next.
+
+        `stage` (J,) are the present ones.
+        """
         allowed = wish
         for junction, (first, latest_s) in self._next.items():
             wished = wish[junction]
-            back_s = 0.0 if wished == view.stage[junction] else self._lasts_s[wished]
-            if wished != first and view.time_s + back_s + LOOK_S > latest_s:
+            back_s = 0.0 if wished == stage[junction] else self._lasts_s[wished]
+            if wished != first and now_s + back_s + LOOK_S > latest_s:
                 allowed = wish.copy() if allowed is wish else allowed
                 allowed[junction] = first
         return allowed
 
-    def _look(self, view: View) -> None:
+    def look(self, view: View) -> None:
+        """See who waits, if it is time to."""
+        if view.time_s < self._look_s:
+            return
+        self._look_s = view.time_s + LOOK_S
         waits, troubled = _look(
             view.time_s, view.stage, view.set_waiting_veh, view.calling, self._way_set, self._needs, self._served,
             self._junction, self._carefree_s, self._stood_s, self._since_s,

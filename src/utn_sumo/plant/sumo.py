@@ -275,8 +275,10 @@ class SumoPlant:
             free = heads.free(self.time_s)
             # An execution that keeps in mind who has come looks every time, though no junction may be free.
             view = Sight(self._eyes, heads, self.time_s, free)
-            wish = heads.patience.allow(self._wish(execution, view), view)
-            if wish is not view.stage:
+            # Whatever a foreign execution writes into what it sees: nothing here goes by that.
+            heads.patience.look(view)
+            wish = heads.patience.allow(self._wish(execution, view), heads.stage, self.time_s)
+            if wish is not heads.stage:
                 for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
                     heads.switch(index, int(wish[index]), self.time_s)
             self._decision_s += execution.every_s
@@ -293,17 +295,19 @@ class SumoPlant:
         self.decision_time_s += time.perf_counter() - started
 
     def _wish(self, execution: Execution, view: View) -> Ints:
-        """What the execution wishes; the present stages if it fails to name stages of the junctions."""
+        """What the execution wishes; the heads' own stages where that is no others, or names none of each junction."""
+        present: Ints = self._heads.stage
         try:
             wish = np.asarray(execution.wish(view))
-            if wish is view.stage:
-                return wish
             # Counting takes half the time of any().
-            if wish.shape != view.stage.shape or np.count_nonzero(self.network.stage_junction[wish] != self._junctions):
+            if wish is view.stage and not np.count_nonzero(wish != present):
+                return present
+            others = wish.shape != present.shape or (wish < 0) | (self.network.stage_junction[wish] != self._junctions)
+            if np.count_nonzero(others):
                 raise PlanError(f"{wish.tolist()} is no stage for each junction")  # noqa: TRY301 - one way out
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a foreign execution may raise anything
             self._failed(error)
-            return view.stage
+            return present
         return wish
 
     def _failed(self, error: BaseException) -> None:
