@@ -13,6 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -34,6 +35,8 @@ CLOSE_ZONES = 2
 """Who is in these, up to 50 m, is at the stop line within a few seconds."""
 SAMPLE_S = 10.0
 """Longest time between two readings of the entry loops (the paper's sampling interval)."""
+LEAST_PAUSE_S = 1.0
+"""Least time between two decisions of an execution."""
 
 
 @dataclass(frozen=True)
@@ -758,7 +761,7 @@ class Execution(Protocol):
     """
 
     every_s: float
-    """Time until the next decision, read anew after each: a second or more."""
+    """Time until the next decision, read anew after each: a second or more (`is_pause`)."""
 
     def begin(self, plan: Plan, state: State) -> None:
         """Take up the plan of a new control step, and the state that it was made from."""
@@ -767,6 +770,11 @@ class Execution(Protocol):
     def wish(self, view: View) -> Ints:
         """(J,) stage that each junction is to show from now on. Its least green and the clearance are kept anyway."""
         ...
+
+
+def is_pause(every_s: object) -> bool:
+    """Whether that may be the time between two decisions of an execution."""
+    return isinstance(every_s, Real) and LEAST_PAUSE_S <= float(every_s) < np.inf
 
 
 @runtime_checkable

@@ -10,16 +10,21 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from inspect import Parameter
+from numbers import Integral
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from utn_sumo.contract import Controller, Execution, Network
+from utn_sumo.contract import Controller, Execution, Network, is_pause
 from utn_sumo.errors import ControllerError, SettingError, UtnError, did_you_mean
 from utn_sumo.scenario import EXACT, Scenario, explain
 
 T = TypeVar("T")
+
+MOST_HORIZON = 1000
+"""Cycles of forecast at most: each is in every line of a run's record."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +66,9 @@ def registered(kind: Kind = CONTROLLER) -> dict[str, EntryPoint]:
 def build(name: str, network: Network, settings: dict[str, Any]) -> Controller:
     """The controller called `name`, built for `network`. Raises ControllerError or SettingError."""
     found: Controller = _built(CONTROLLER, name, network, settings)
-    if not isinstance(found.horizon, int) or found.horizon < 1:
-        raise ControllerError(f"controller {name!r} has horizon {found.horizon!r}: make it a whole number from 1 on")
+    if not isinstance(found.horizon, Integral) or not 1 <= found.horizon <= MOST_HORIZON:
+        least_most = f"make it a whole number from 1 on, {MOST_HORIZON} at most"
+        raise ControllerError(f"controller {name!r} has horizon {found.horizon!r}: {least_most}")
     return found
 
 
@@ -74,13 +80,20 @@ def build_execution(scenario: Scenario, network: Network, controller: Controller
     settings, name = scenario.execution_settings, scenario.execution
     if name is None:
         own = getattr(controller, "execution", None)
-        return (EXACT, None) if own is None else (_name_of(own), own)
+        if own is None:
+            return EXACT, None
+        return _name_of(own), _deciding(own, f"execution {own!r} of controller {scenario.controller!r}")
     if name == EXACT:
         return name, None
-    found: Execution = _built(EXECUTION, name, network, settings)
-    if not found.every_s >= 1:
-        raise ControllerError(f"execution {name!r} decides every {found.every_s!r} s: make `every_s` 1 or more")
-    return name, found
+    return name, _deciding(_built(EXECUTION, name, network, settings), f"execution {name!r}")
+
+
+def _deciding(found: Any, who: str) -> Execution:
+    """An execution that may be asked. Raises ControllerError."""
+    _check_contract(EXECUTION, found, who)
+    if not is_pause(found.every_s):
+        raise ControllerError(f"{who} decides every {found.every_s!r} s: make `every_s` 1 or more")
+    return found  # type: ignore[no-any-return]
 
 
 def _name_of(execution: Execution) -> str:
@@ -92,9 +105,13 @@ def _name_of(execution: Execution) -> str:
 
 def _built(kind: Kind, name: str, network: Network, settings: dict[str, Any]) -> Any:
     found = made(name, maker(name, kind), settings, network, noun=kind.noun)
-    if not isinstance(found, kind.contract):
-        raise ControllerError(f"{kind.noun} {name!r} lacks {kind.needs}: see contract.{kind.noun.capitalize()}")
+    _check_contract(kind, found, f"{kind.noun} {name!r}")
     return found
+
+
+def _check_contract(kind: Kind, found: Any, who: str) -> None:
+    if not isinstance(found, kind.contract):
+        raise ControllerError(f"{who} lacks {kind.needs}: see contract.{kind.noun.capitalize()}")
 
 
 def maker(name: str, kind: Kind = CONTROLLER) -> Callable[..., Any]:
@@ -112,7 +129,7 @@ def made(name: str, factory: Callable[..., T], settings: dict[str, Any], *given:
     """
     takes = settings_of(factory)
     for word in settings:
-        if word not in takes:
+        if word not in takes and not _takes_any(factory):
             rest = did_you_mean(word, takes) if takes else "it takes none"
             raise SettingError(f"{noun} {name!r} has no setting {word!r}: {rest}")
     try:
@@ -130,7 +147,15 @@ def settings_of(factory: Any) -> list[str]:
     model = getattr(factory, "Settings", None)
     if model is not None:
         return list(model.model_fields)
-    return [word for word in inspect.signature(factory).parameters if word != "network"]
+    arguments = inspect.signature(factory).parameters.values()
+    nameless = {Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL}
+    return [each.name for each in arguments if each.name != "network" and each.kind not in nameless]
+
+
+def _takes_any(factory: Any) -> bool:
+    """Whether a class takes settings of whatever name, as by `**settings` without a `Settings` model."""
+    arguments = inspect.signature(factory).parameters.values()
+    return not hasattr(factory, "Settings") and any(each.kind is Parameter.VAR_KEYWORD for each in arguments)
 
 
 def takes_those_of_execution(name: str) -> bool:

@@ -25,6 +25,8 @@ from utn_sumo.scenario import scenario
 Run = Callable[..., tuple[dict[str, Any], Path]]
 
 OWN = """
+import numpy as np
+
 class Keeps:
     def __init__(self, network, every_s=5):
         self.every_s = every_s
@@ -88,6 +90,18 @@ class CountsBack(Keeps):
     def wish(self, view):
         view.stage[-1] = -1
         return view.stage
+
+class Ends(Keeps):
+    def wish(self, view):
+        self.every_s = {5: 0, 6: -5, 7: float("nan"), 8: "q", 9: np.int64(4)}.get(int(view.time_s), 5)
+        return view.stage
+
+class Planner:
+    horizon = 1
+    def __init__(self, network, carried_out=None, every_s=5):
+        self.network, self.execution = network, carried_out or Keeps(network, every_s)
+    def plan(self, state, forecast):
+        return self.network.equal_split()
 
 class Hasty(Keeps):
     def __init__(self, network):
@@ -182,6 +196,15 @@ def test_what_an_execution_writes_into_what_it_sees_is_its_wish_alone(own: str, 
     assert all(len(switches) > 50 for switches in shown[0].values())
 
 
+def test_an_execution_that_does_not_say_when_to_ask_it_again_is_written_down_and_asked_after_a_second(
+    own: str, tmp_path: Path
+) -> None:
+    result = bridge.run(scenario(controller="fixed", execution=f"{own}:Ends", hours=0.02), tmp_path / "run")
+    said = [reason.rpartition(": `every_s` is ")[::2] for reason in result["fallback_reasons"]]
+    assert [when.partition(" execution")[0] for when, _ in said] == ["at 5 s", "at 6 s", "at 7 s", "at 8 s"]
+    assert [what.partition(":")[0] for _, what in said] == ["0", "-5", "nan", "'q'"]
+
+
 @pytest.mark.parametrize("name", ["Counts", "Wavers"])
 def test_an_execution_is_asked_every_time_whether_a_junction_is_free_or_none(
     own: str, name: str, tmp_path: Path
@@ -198,6 +221,14 @@ def test_an_execution_is_asked_every_time_whether_a_junction_is_free_or_none(
         ({"execution": "none.py:Own"}, ControllerError, "there is no file 'none.py'"),
         ({"execution": "OWN:Hasty"}, ControllerError, "make `every_s` 1 or more"),
         ({"execution": "OWN:Idle"}, ControllerError, "lacks `every_s`"),
+        ({"execution": "OWN:Keeps", "settings": {"execution": {"every_s": "x"}}}, ControllerError, "every 'x' s: make"),
+        (
+            {"controller": "OWN:Planner", "settings": {"carried_out": "actuated"}},
+            ControllerError,
+            "execution 'actuated'",
+        ),
+        ({"controller": "OWN:Planner", "settings": {"carried_out": 3}}, ControllerError, "execution 3 of controller"),
+        ({"controller": "OWN:Planner", "settings": {"every_s": 0.5}}, ControllerError, "decides every 0.5 s: make"),
         ({"execution": "actuated", "settings": {"execution": {"gap": 2}}}, SettingError, "did you mean 'gap_s'?"),
         ({"execution": "actuated", "settings": {"execution": {"gap_s": 0}}}, SettingError, "'gap_s' is 0"),
         ({"execution": "actuated", "settings": {"execution": 2}}, SettingError, "must be a table"),
@@ -221,7 +252,7 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(
     settings: dict[str, Any], kind: type[UtnError], complaint: str, own: str, tmp_path: Path
 ) -> None:
     settings = {"controller": "fixed", **settings}
-    settings |= {"execution": settings["execution"].replace("OWN", own)} if "execution" in settings else {}
+    settings |= {name: settings[name].replace("OWN", own) for name in ("controller", "execution") if name in settings}
     with pytest.raises(kind) as caught:
         bridge.run(scenario(**settings), tmp_path / "run")
     assert complaint in str(caught.value)

@@ -189,11 +189,35 @@ def test_of_a_file_that_can_not_be_loaded_nothing_is_left(tmp_path: Path, utn17:
     assert set(sys.modules) == before
 
 
-@pytest.mark.parametrize("horizon", ["x", 0, 1.5, None])
+@pytest.mark.parametrize("horizon", ["x", 0, 1.5, None, 10**7])
 def test_a_horizon_that_is_no_number_of_cycles_is_named(utn17: Network, tmp_path: Path, horizon: object) -> None:
     file = tmp_path / "mine.py"
     file.write_text(OWN.replace("horizon = 3", f"horizon = {horizon!r}"), encoding="utf-8")
     assert f"has horizon {horizon!r}: make it a whole number from 1 on" in complaint(utn17, f"{file}:Mine")
+
+
+def test_numpy_s_whole_numbers_are_horizons_too(utn17: Network, tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("import numpy as np\n" + OWN.replace("horizon = 3", "horizon = np.int64(2)"), encoding="utf-8")
+    assert controllers.build(f"{file}:Mine", utn17, {}).horizon == 2
+
+
+def test_a_class_that_takes_settings_of_whatever_name_is_given_them(utn17: Network, own: Path) -> None:
+    anything = """
+class Open(Mine):
+    def __init__(self, network, gain=1.0, *rest, **settings):
+        super().__init__(network, gain)
+        self.settings = settings
+
+class HandedOn(Mine):
+    def __init__(self, network, **settings):
+        super().__init__(network, **settings)
+"""
+    own.write_text(OWN + anything, encoding="utf-8")
+    taken: Any = controllers.build(f"{own}:Open", utn17, {"gain": 2.0, "foo": 3})
+    assert (taken.gain, taken.settings) == (2.0, {"foo": 3})
+    assert controllers.settings_of(controllers.maker(f"{own}:Open")) == ["gain"]
+    assert "can't be built: TypeError" in complaint(utn17, f"{own}:HandedOn", foo=3)
 
 
 def test_a_file_that_ends_the_process_cannot_be_loaded(utn17: Network, tmp_path: Path) -> None:

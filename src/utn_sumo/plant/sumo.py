@@ -21,6 +21,7 @@ from utn_sumo import detectors
 from utn_sumo.case import Case, in_digits
 from utn_sumo.contract import (
     AREA_REACH_M,
+    LEAST_PAUSE_S,
     SAMPLE_S,
     Bools,
     Execution,
@@ -31,6 +32,7 @@ from utn_sumo.contract import (
     Plan,
     State,
     View,
+    is_pause,
 )
 from utn_sumo.errors import PlanError, PlantError
 from utn_sumo.plant.eyes import Eyes, Sight
@@ -281,7 +283,7 @@ class SumoPlant:
             if wish is not heads.stage:
                 for index in (free & (wish != heads.stage)).nonzero()[0].tolist():
                     heads.switch(index, int(wish[index]), self.time_s)
-            self._decision_s += execution.every_s
+            self._decision_s += self._pause_s(execution)
         self.access_time_s += self._eyes.sumo_time_s - read_s
         self.decision_time_s += time.perf_counter() - started
         return min(self._decision_s, heads.next_s)
@@ -309,6 +311,17 @@ class SumoPlant:
             self._failed(error)
             return present
         return wish
+
+    def _pause_s(self, execution: Execution) -> float:
+        """Time until the execution is asked again; the least there is if it does not say."""
+        try:
+            every_s = execution.every_s
+            if not is_pause(every_s):
+                raise PlanError(f"`every_s` is {every_s!r}: make it 1 or more")  # noqa: TRY301 - one way out
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a foreign execution may raise anything
+            self._failed(error)
+            return LEAST_PAUSE_S
+        return every_s
 
     def _failed(self, error: BaseException) -> None:
         self.failures.append(f"at {self.time_s:g} s execution: {type(error).__name__}: {error}")
