@@ -36,8 +36,6 @@ from utn_sumo.prediction import Predictor
 from utn_sumo.scenario import Scenario
 from utn_sumo.supervisor import Decision, Supervisor
 
-WHOLE = 1e-6
-"""By how much a number of steps in a second may be off."""
 UNKNOWN_VEH = 1.0
 """Vehicles that usually come onto a link amid it in a control step, where nobody says how many."""
 
@@ -82,8 +80,6 @@ def run(
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.controller_settings)
     carried_out, execution = controllers.build_execution(scenario, known, controller)
-    if chosen is not None:
-        _check_step(chosen, carried_out)
     step_s, duration_s = net.control_step_s, _duration_s(scenario, chosen)
     steps = int(np.ceil(duration_s / step_s))
     driving = chosen or traffic.drawn(scenario, net)
@@ -175,17 +171,6 @@ def _duration_s(scenario: Scenario, chosen: Case | None) -> float:
     if chosen is None:
         return scenario.duration_s
     return LONGEST_RUN_S if chosen.end_s is None else chosen.end_s - chosen.begin_s
-
-
-def _check_step(chosen: Case, execution: str) -> None:
-    """Raise SettingError for steps with which signals can't be switched as they are meant to be."""
-    in_second = 1 / chosen.step_s
-    # Executions look what time it is; to the second, greens and yellows end where a step does, or one step later.
-    if chosen.step_s > 1 or (execution == "exact" and abs(in_second - round(in_second)) > WHOLE):
-        raise SettingError(
-            f"scenario {str(chosen.file)!r} has a step-length of {chosen.step_s:g} s: execution {execution!r} switches "
-            "signals to the second, make it 1 s or a whole part of it, such as 0.5 or 0.2 s"
-        )
 
 
 def _progress(time_s: float, duration_s: float, seen: Look) -> Progress:

@@ -12,6 +12,9 @@ from utn_sumo.contract import Network
 from utn_sumo.errors import SettingError
 from utn_sumo.network import Traffic
 
+WHOLE = 1e-6
+"""By how much a number of steps in a second may be off."""
+
 
 def named(name: str) -> Network:
     """The network of a shipped net, a net file, or a .sumocfg, as `controllable`. Raises UtnError."""
@@ -24,11 +27,18 @@ def controllable(chosen: Case, usual_green_s: float = network.MIN_GREEN_S) -> Ne
     Offsets count from the begin of the case's window. A stage for which the net names no least green has
     `usual_green_s`.
 
-    Raises SettingError for a mesoscopic case, where there are no lanes to watch.
+    Raises SettingError for a mesoscopic case, where there are no lanes to watch, and for steps with which signals can't
+    be switched to the second.
     """
     if dict(chosen.options).get("mesosim", "false") == "true":
         raise SettingError(
             f"scenario {str(chosen.file)!r} has mesosim, which knows no lanes: leave it out, or use --controller native"
+        )
+    # Greens and yellows end where a step does: with others they would be up to a step too short.
+    if chosen.step_s > 1 or abs(1 / chosen.step_s - round(1 / chosen.step_s)) > WHOLE:
+        raise SettingError(
+            f"scenario {str(chosen.file)!r} has a step-length of {chosen.step_s:g} s: signals are switched to the "
+            "second, make it 1 s or a whole part of it, such as 0.5 or 0.2 s, or use --controller native"
         )
     net = _with_refused_left_alone(str(chosen.net_file), chosen.additional_files, routes.read(chosen), usual_green_s)
     # Our clock begins where the window does.
