@@ -14,9 +14,6 @@ from utn_sumo import monitor
 from utn_sumo.contract import Bools, Floats, Network
 from utn_sumo.errors import ResultError
 
-HUNDREDTH_S = 0.01
-"""To which SUMO writes times."""
-
 
 def trip_measures(trips: Path, called: Collection[str] = (), end_s: float = math.inf) -> dict[str, Any]:
     """Sums over every vehicle that wanted to travel, whether it arrived, was under way or still waited to enter.
@@ -35,7 +32,7 @@ def trip_measures(trips: Path, called: Collection[str] = (), end_s: float = math
             if trip.tag != "tripinfo":
                 continue
             wait_s, road_s = float(trip.attrib["departDelay"]), float(trip.attrib["duration"])
-            never_called = float(trip.attrib["depart"]) < 0 and wait_s >= end_s - HUNDREDTH_S
+            never_called = float(trip.attrib["depart"]) < 0 and wait_s >= end_s - monitor.HUNDREDTH_S
             # Where traffic is scaled up, copies of a vehicle have its id and a number.
             if never_called and (trip.attrib["id"] in called or trip.attrib["id"].rpartition(".")[0] in called):
                 continue
@@ -104,7 +101,7 @@ class Greens:
 
     def __init__(self, network: Network, switches: Path, duration_s: float, begin_s: float = 0.0):
         """Of a run of `duration_s` that began at SUMO's time `begin_s`. Raises ResultError."""
-        shown = monitor.read_switches(switches)
+        shown = monitor.read_switches(switches, begin_s)
         self._turns = len(network.turns)
         self._spans: dict[int, tuple[Floats, Floats]] = {}
         """Of each turn with signals when its greens began and ended."""
@@ -113,7 +110,7 @@ class Greens:
         junction_of_set = network.link_junction[network.set_link]
         for index, junction in enumerate(network.junctions):
             switched = shown.get(junction.id, [])
-            times = np.array([second - begin_s for second, _ in switched] + [duration_s], dtype=float)
+            times = np.array([time_s for time_s, _ in switched] + [duration_s], dtype=float)
             letters = np.array([[letter in monitor.GREEN for letter in state] for _, state in switched], dtype=bool)
             if not len(letters):
                 continue

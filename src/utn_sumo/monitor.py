@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 from utn_sumo.contract import Junction, Network
 from utn_sumo.errors import ResultError
@@ -17,7 +18,10 @@ from utn_sumo.errors import ResultError
 LETTERS = frozenset("GgyYrsu")
 """What a working signal shows; SUMO's o and O are signals switched off."""
 GREEN, YELLOW = "Gg", "yY"
-LONG_AGO_S = -(10**9)
+LONG_AGO_S = -1e9
+HUNDREDTH_S = 0.01
+MILLISECOND_S = 0.001
+"""SUMO's clock has no finer times."""
 
 
 @dataclass
@@ -32,8 +36,9 @@ class Verdict:
         """Seconds in which some junction's signals were unsafe, summed over junctions."""
         return len(self.seconds)
 
-    def flag(self, junction: str, second: int, reason: str) -> None:
-        """Count a second; the reason is kept once."""
+    def flag(self, junction: str, time_s: float, reason: str) -> None:
+        """Count the second that a time is in; the reason is kept once."""
+        second = math.floor(time_s)
         if (junction, second) not in self.seconds:
             self.seconds.add((junction, second))
             self.reasons.append(f"{junction} at {second} s: {reason}")
@@ -51,33 +56,48 @@ def watch(
     green that ends without its full yellow; a conflicting green before the clearance that the net prescribes between
     the two has run; a green shorter than the least; letters that no signal has; nothing shown at all.
     """
-    shown = read_switches(switches)
+    shown = read_switches(switches, begin_s)
     verdict = Verdict()
     for junction in network.junctions:
-        switched = [(second - int(begin_s), state) for second, state in shown.get(junction.id, [])]
         rules = _Rules.of(network, junction) if in_order else _Rules.in_any_order(network, junction)
-        _Guard(network, junction, rules, verdict).judge(_stretches(switched, int(duration_s)))
+        _Guard(network, junction, rules, verdict).judge(_stretches(shown.get(junction.id, []), duration_s))
     return verdict
 
 
-def read_switches(path: Path) -> dict[str, list[tuple[int, str]]]:
-    """(second, letters) of every switch, by junction."""
+def read_switches(path: Path, begin_s: float = 0.0) -> dict[str, list[tuple[float, str]]]:
+    """(time since the run began at `begin_s`, to the millisecond, letters) of every switch, by junction."""
     from defusedxml import ElementTree  # noqa: PLC0415
 
-    shown: dict[str, list[tuple[int, str]]] = {}
+    shown: dict[str, list[tuple[float, str]]] = {}
     try:
         for _, element in ElementTree.iterparse(path):
             if element.tag == "tlsState":
-                shown.setdefault(element.get("id"), []).append((int(float(element.get("time"))), element.get("state")))
+                time_s = round(float(element.get("time")) - begin_s, 3)
+                # Where steps are of hundredths SUMO writes no thousandths, though the begin may have some.
+                time_s = 0.0 if abs(time_s) < HUNDREDTH_S else time_s
+                shown.setdefault(element.get("id"), []).append((time_s, element.get("state")))
     except (OSError, ElementTree.ParseError) as error:
         raise ResultError(f"signal record {str(path)!r} can't be read ({error})") from error
     return shown
 
 
-def _stretches(switches: list[tuple[int, str]], duration_s: int) -> list[tuple[str, range]]:
-    """(letters, seconds in which they were shown), without a gap from 0 to the end; "" where nothing was shown."""
-    starts = [(0, ""), *switches, (duration_s, "")]
-    return [(state, range(start, min(end, duration_s))) for (start, state), (end, _) in pairwise(starts) if end > start]
+def _stretches(switches: list[tuple[float, str]], duration_s: float) -> list[_Stretch]:
+    """What was shown, without a gap from 0 to the end; "" where nothing was."""
+    starts = [(0.0, ""), *switches, (round(duration_s, 3), "")]
+    last_s = starts[-1][0]
+    return [
+        _Stretch(state, start_s, min(end_s, last_s))
+        for (start_s, state), (end_s, _) in pairwise(starts)
+        if start_s < min(end_s, last_s)
+    ]
+
+
+class _Stretch(NamedTuple):
+    """Letters, and when they were shown."""
+
+    state: str
+    start_s: float
+    end_s: float
 
 
 @dataclass(frozen=True)
@@ -153,54 +173,55 @@ class _Guard:
         """What a cycle ends with: nor did anybody see how long a green has lasted that goes on round it."""
         size = len(junction.conflicts)
         self.foes = [[b for b in range(size) if junction.conflicts[a][b]] for a in range(size)]
-        self.green_since = [0] * size
-        self.yellow_since = [LONG_AGO_S if self.under_way else 0] * size
-        self.last_green = [LONG_AGO_S] * size
+        self.green_since_s = [0.0] * size
+        self.yellow_since_s = [LONG_AGO_S if self.under_way else 0.0] * size
+        self.green_until_s = [LONG_AGO_S] * size
         self.protected = [False] * size
         """Whether a signal has its protected green, or the yellow that clears it."""
 
-    def judge(self, stretches: list[tuple[str, range]]) -> None:
-        """Look at every second in turn; signals change only where a stretch begins."""
+    def judge(self, stretches: list[_Stretch]) -> None:
+        """Look at every stretch in turn: signals change only where one begins."""
         dark = "r" * len(self.foes)
         previous = dark
-        for state, seconds in stretches:
+        for stretch in stretches:
+            state = stretch.state
             if len(state) != len(self.foes) or not LETTERS.issuperset(state):
-                self._flag_all(seconds, f"shows {state!r}")
+                self._flag_all(stretch, f"shows {state!r}")
                 previous = dark
                 continue
             for signal, letter in enumerate(state):
                 self.protected[signal] = letter == "G" or (letter in YELLOW and self.protected[signal])
             if clash := self._clash(state):
-                self._flag_all(seconds, "signals {} and {} conflict and are open together".format(*clash))
+                self._flag_all(stretch, "signals {} and {} conflict and are open together".format(*clash))
             for signal, (was, now) in enumerate(zip(previous, state, strict=True)):
-                if reason := self._change(signal, was, now, seconds.start, state):
-                    self.verdict.flag(self.junction.id, seconds.start, f"signal {signal} {reason}")
+                if reason := self._change(signal, was, now, stretch):
+                    self.verdict.flag(self.junction.id, stretch.start_s, f"signal {signal} {reason}")
             for signal, letter in enumerate(state):
                 if letter in GREEN:
-                    self.last_green[signal] = seconds[-1]
+                    self.green_until_s[signal] = stretch.end_s
             previous = state
 
-    def _flag_all(self, seconds: range, reason: str) -> None:
-        for second in seconds:
+    def _flag_all(self, stretch: _Stretch, reason: str) -> None:
+        for second in range(math.floor(stretch.start_s), math.ceil(stretch.end_s)):
             self.verdict.flag(self.junction.id, second, reason)
 
-    def _change(self, signal: int, was: str, now: str, second: int, state: str) -> str:
-        """What is wrong with one signal's change at this second; empty if nothing is."""
-        rules = self.rules
+    def _change(self, signal: int, was: str, now: str, stretch: _Stretch) -> str:
+        """What is wrong with one signal's change as a stretch begins; empty if nothing is."""
+        rules, now_s = self.rules, stretch.start_s
         if now in GREEN and was not in GREEN:
             lasts = self.under_way or self.ends[signal] in GREEN
-            self.green_since[signal] = LONG_AGO_S if second == 0 and lasts else second
+            self.green_since_s[signal] = LONG_AGO_S if now_s == 0 and lasts else now_s
             for foe in self.foes[signal]:
-                since_s = second - self.last_green[foe] - 1
-                if now == "G" and state[foe] not in GREEN and since_s < rules.between_s[foe][signal]:
+                between_s = now_s - self.green_until_s[foe]
+                if now == "G" and stretch.state[foe] not in GREEN and _less(between_s, rules.between_s[foe][signal]):
                     return f"turns green too soon after signal {foe}"
         elif was in GREEN and now not in GREEN:
-            self.yellow_since[signal] = second
+            self.yellow_since_s[signal] = now_s
             if now == "r" and signal not in self.junction.without_yellow:
                 return f"goes from green to {now!r} without yellow"
-            if second - self.green_since[signal] < rules.green_s[signal]:
+            if _less(now_s - self.green_since_s[signal], rules.green_s[signal]):
                 return "was green for less than its least"
-        if was in YELLOW and now not in YELLOW and second - self.yellow_since[signal] < rules.yellow_s[signal]:
+        if was in YELLOW and now not in YELLOW and _less(now_s - self.yellow_since_s[signal], rules.yellow_s[signal]):
             return "had too little yellow"
         return ""
 
@@ -212,3 +233,8 @@ class _Guard:
                     if self.protected[foe]:
                         return signal, foe
         return None
+
+
+def _less(lasted_s: float, least_s: float) -> bool:
+    """Whether something lasted less than its least, but for what sums of milliseconds are off by."""
+    return lasted_s < least_s - MILLISECOND_S / 2

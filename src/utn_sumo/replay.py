@@ -7,6 +7,7 @@ keep the net's own programme.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from utn_sumo.plant.sumo import records, run_arguments
 
 FOLDER = "replay"
 PROGRAM = "replay"
+MICROHOUR_S = 0.0036
 
 
 def write(folder: Path) -> Path:
@@ -31,8 +33,9 @@ def write(folder: Path) -> Path:
     settings = recording.read_json(folder, recording.SETTINGS)
     result = recording.read_json(folder, recording.RESULT)
     try:
-        seed, duration_s = int(settings["scenario"]["seed"]), round(result["hours"] * 3600)
+        seed = int(settings["scenario"]["seed"])
         chosen = Case.recorded(settings["case"]) if "case" in settings else None
+        duration_s = _duration_s(result["hours"], 1.0 if chosen is None else chosen.step_s)
         controlled = result["controller"] not in sumo_signals.RUNS
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ResultError(f"{str(folder)!r} lacks a run's seed or length: give one that `utn run` wrote") from error
@@ -43,15 +46,15 @@ def write(folder: Path) -> Path:
     target = folder / FOLDER
     if target.exists():
         raise ResultError(f"{str(target)!r} is there already: remove it to write the replay anew")
-    switches = monitor.read_switches(folder / "signals.xml")
+    begin_s = 0.0 if chosen is None else chosen.begin_s
+    switches = monitor.read_switches(folder / "signals.xml", begin_s)
     if not switches:
         raise ResultError(f"{str(folder)!r} has no recorded signals: the run ended before its first second")
     left_alone = result.get("left_alone", {}) if controlled else switches
-    begin_s = 0.0 if chosen is None else chosen.begin_s
     target.mkdir()
     signals = target / "signals.add.xml"
     shown = {junction: each for junction, each in switches.items() if junction not in left_alone}
-    _write_programmes(signals, shown, begin_s, begin_s + duration_s)
+    _write_programmes(signals, shown, begin_s, duration_s)
     if chosen is None:
         above, programmes = Path(".."), folder / recording.PROGRAMMES
         arguments = run_arguments(
@@ -78,14 +81,21 @@ def _check_files(folder: Path, recorded: Mapping[str, Any]) -> None:
             raise ResultError(f"{str(folder)!r} was made from {name!r}, which {what}: put it back, or run it anew")
 
 
-def _write_programmes(path: Path, switches: dict[str, list[tuple[int, str]]], begin_s: float, end_s: float) -> None:
+def _duration_s(hours: float, step_s: float) -> float:
+    """How long a run was that is recorded in `hours`, to a microhour: as many steps as it took to get there."""
+    return math.ceil((hours * 3600 - MICROHOUR_S) / step_s) * step_s
+
+
+def _write_programmes(
+    path: Path, switches: dict[str, list[tuple[float, str]]], begin_s: float, duration_s: float
+) -> None:
     root = ET.Element("additional")
     for junction, shown in switches.items():
         # A programme runs round as if it had begun at its offset: this one begins with the run.
         logic = ET.SubElement(
             root, "tlLogic", id=junction, type="static", programID=PROGRAM, offset=case.in_digits(begin_s)
         )
-        ends = [start for start, _ in shown[1:]] + [end_s]
+        ends = [start for start, _ in shown[1:]] + [duration_s]
         for (start, state), end in zip(shown, ends, strict=True):
             if end > start:
                 ET.SubElement(logic, "phase", duration=case.in_digits(end - start), state=state)

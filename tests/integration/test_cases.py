@@ -270,6 +270,22 @@ def test_bare_sumo_replays_its_runs_vehicle_for_vehicle(
     assert ('"J1"' in text, '"J2"' in text) == (controller == "fixed", False)
 
 
+@pytest.mark.parametrize("step_s", ["1", "0.2"])
+@pytest.mark.parametrize("controller", ["fixed", "recommended"])
+def test_a_run_that_begins_amid_a_second_is_replayed_too(
+    town: Path, tmp_path: Path, controller: str, step_s: str
+) -> None:
+    text = town.read_text(encoding="utf-8").replace('"6:00:00"', '"21600.5"').replace('"0.5"', f'"{step_s}"')
+    town.write_text(text, encoding="utf-8")
+    result = bridge.run(scenario(net=str(town), controller=controller), tmp_path / "run")
+    assert result["unsafe_reasons"] == []
+    configuration = replay.write(tmp_path / "run")
+    subprocess.run([sumo_binary("sumo"), "-c", str(configuration)], check=True, capture_output=True)
+    recorded = trips(tmp_path / "run" / "trips.xml")
+    assert len(recorded) > 300
+    assert trips(configuration.with_name("trips.xml")) == recorded
+
+
 @pytest.mark.parametrize(("change", "says"), [("move", "is gone from there"), ("edit", "has changed since")])
 def test_a_run_whose_files_are_not_what_they_were_is_not_replayed(
     town: Path, tmp_path: Path, change: str, says: str

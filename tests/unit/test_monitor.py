@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -75,6 +76,8 @@ def test_whatever_plan_is_admitted_is_shown_without_an_unsafe_second(
         ([("G" * 10, 240)], "conflict"),
         ([(FIRST, 40), (RED, 5), (SECOND, 195)], "without yellow"),
         ([(FIRST, 40), (YELLOW, 2), (RED, 3), (SECOND, 193)], "too little yellow"),
+        ([(FIRST, 40.2), (YELLOW, 2.8), (RED, 3), (SECOND, 194)], "too little yellow"),
+        ([(FIRST, 40.2), (YELLOW, 3), (RED, 1.8), (SECOND, 195)], "too soon"),
         ([(FIRST, 40), (YELLOW, 3), (RED, 1), (SECOND, 196)], "too soon"),
         ([(FIRST, 40), (YELLOW, 3), (SECOND, 197)], "too soon"),
         ([(FIRST, 40), ("yyyGGGGrrr", 3), (SECOND, 197)], "conflict"),
@@ -88,6 +91,8 @@ def test_whatever_plan_is_admitted_is_shown_without_an_unsafe_second(
         "all green",
         "no yellow",
         "yellow of two seconds",
+        "yellow of less than three",
+        "red of less than two",
         "red of one second",
         "no red",
         "green against yellow",
@@ -103,6 +108,22 @@ def test_an_unsafe_signal_is_counted_with_its_reason(utn17: Network, record: Pat
     assert verdict.unsafe_signal_s > 0
     assert {junction for junction, _ in verdict.seconds} == {"J1"}
     assert any(line.startswith("J1 at ") and reason in line for line in verdict.reasons)
+
+
+@pytest.mark.parametrize("begin_s", [0.5, 600.125, 21600.3])
+def test_a_run_may_begin_amid_a_second(utn17: Network, record: Path, begin_s: float) -> None:
+    judge(utn17, record)
+    tree = ET.parse(record)
+    for switch in tree.getroot():
+        # As SUMO writes it: hundredths.
+        switch.set("time", f"{begin_s + float(switch.attrib['time']) + 1e-6:.2f}")
+    tree.write(record)
+    assert monitor.watch(utn17, record, DURATION_S, begin_s).reasons == []
+
+
+def test_a_run_that_ends_amid_a_second_is_judged_to_its_end(utn17: Network, record: Path) -> None:
+    record.write_text("<tlsStates/>", encoding="utf-8")
+    assert monitor.watch(utn17, record, 9.5).unsafe_signal_s == 8 * 10
 
 
 def starting_at(net: Network, offset_s: float) -> Network:
