@@ -14,7 +14,7 @@ from scipy import stats
 
 from utn_sumo import bridge, campaign, controllers, native, streets
 from utn_sumo.case import SUFFIX
-from utn_sumo.errors import NetworkError, ResultError
+from utn_sumo.errors import NetworkError, ResultError, SettingError
 from utn_sumo.scenario import EXACT, flat, scenario
 
 SPENT = "total_time_spent_veh_h"
@@ -46,9 +46,14 @@ def jobs(
     """Settings of every run, checked. Without `hours` they take two, and a .sumocfg its own window.
 
     Without `demands` it is 1.3, and a .sumocfg's own. A controller may be followed by the execution of its plans, as in
-    dmpc/actuated, or be a TOML file that names it and its settings, as `utn tune` writes. Raises UtnError.
+    dmpc/actuated, or be a TOML file that names it and its settings, as `utn tune` writes. Raises UtnError, for two
+    names of the same controller too.
     """
     chosen = {name: _controller(name) for name in names}
+    first: dict[str, str] = {}
+    for name, said in chosen.items():
+        if (other := first.setdefault(_key(said), name)) != name:
+            raise SettingError(f"controller {name!r} is the same as {other!r}: name one of them")
     found = []
     for net in nets:
         try:
@@ -69,13 +74,18 @@ def jobs(
 def _controller(name: str) -> Job:
     """The settings of a run that say who controls it. Raises UtnError."""
     named = scenario(Path(name)) if name.endswith(".toml") else scenario(**_spelt(name))
+    told = ("controller", "execution", "settings")
+    for key in sorted(named.model_fields_set.difference(told)):
+        raise SettingError(
+            f"file {name!r} has {key} = {getattr(named, key)!r}: of a controller's file a comparison takes "
+            f"{', '.join(told)} alone, leave it out"
+        )
     bridge.check_execution(named)
     if named.controller != native.NAME:
         controllers.maker(named.controller)
     if named.execution not in {None, EXACT}:
         controllers.maker(str(named.execution), controllers.EXECUTION)
-    told = {"controller", "execution"} | ({"settings"} if named.settings else set())
-    return named.model_dump(include=told, exclude_none=True)
+    return named.model_dump(include=set(told if named.settings else told[:2]), exclude_none=True)
 
 
 def _spelt(name: str) -> dict[str, Any]:

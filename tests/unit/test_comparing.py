@@ -15,7 +15,7 @@ from scipy import stats
 import comparing
 import showing
 from utn_sumo import campaign
-from utn_sumo.errors import ResultError, UtnError
+from utn_sumo.errors import ResultError, SettingError, UtnError
 
 DELAYS = st.lists(st.tuples(st.floats(10, 1000), st.floats(10, 1000)), min_size=3, max_size=10)
 
@@ -171,11 +171,26 @@ def test_a_controller_may_be_followed_by_its_execution(
     assert comparing.label(job) == name
 
 
-def test_what_is_named_twice_is_run_and_counted_once(tmp_path: Path) -> None:
-    file = tmp_path / "best.toml"
-    file.write_text('controller = "dmpc"\n[settings]\n', encoding="utf-8")
-    jobs = comparing.jobs(["utn17"], ["1", "1.0"], ["dmpc", "fixed", str(file), "dmpc"], [1, 2], None)
+def test_what_is_named_twice_is_run_and_counted_once() -> None:
+    jobs = comparing.jobs(["utn17"], ["1", "1.0"], ["dmpc", "fixed", "dmpc"], [1, 2], None)
     assert [(job["controller"], job["seed"]) for job in jobs] == [("dmpc", 1), ("dmpc", 2), ("fixed", 1), ("fixed", 2)]
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ("[settings]\n", "is the same as 'dmpc': name one of them"),
+        ('forecast = "last"\n', "has forecast = 'last': .* takes controller, execution, settings alone, leave it out"),
+        ("loop_error = 0.2\n[settings]\nrho = 0.3\n", "has loop_error = 0.2: .* leave it out"),
+    ],
+)
+def test_no_controller_of_a_file_is_lost_or_run_as_another(tmp_path: Path, more: str, says: str) -> None:
+    file = tmp_path / "only.toml"
+    file.write_text('controller = "dmpc"\n' + more, encoding="utf-8")
+    with pytest.raises(SettingError, match=says) as caught:
+        comparing.jobs(["utn17"], None, ["dmpc", str(file)], [1], None)
+    assert str(file) in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_file_s_execution_and_its_settings_are_kept_and_told(tmp_path: Path) -> None:
