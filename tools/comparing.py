@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import statistics
 from collections.abc import Callable, Sequence
@@ -12,10 +13,13 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from utn_sumo import bridge, campaign, controllers, native, streets
+import utn_network
+from utn_sumo import bridge, campaign, case, controllers, native, streets
 from utn_sumo.case import SUFFIX
 from utn_sumo.errors import NetworkError, ResultError, SettingError
+from utn_sumo.importing import FITTED, TURNS
 from utn_sumo.scenario import EXACT, flat, scenario
+from utn_sumo.xml_files import stem
 
 SPENT = "total_time_spent_veh_h"
 COUNTED = ("unsafe_signal_s", "fallbacks", "teleports")
@@ -24,6 +28,7 @@ WAITED = "longest_red_s"
 """Longest red while somebody waits; not known of signals that SUMO switches."""
 SHARE = 0.95
 KEY = ("net", "demand", "controller")
+WHO = ("controller", "execution")
 OPENING = '{"job": '
 """How every line of a record begins."""
 
@@ -74,7 +79,7 @@ def jobs(
 def _controller(name: str) -> Job:
     """The settings of a run that say who controls it. Raises UtnError."""
     named = scenario(Path(name)) if name.endswith(".toml") else scenario(**_spelt(name))
-    told = ("controller", "execution", "settings")
+    told = (*WHO, "settings")
     for key in sorted(named.model_fields_set.difference(told)):
         raise SettingError(
             f"file {name!r} has {key} = {getattr(named, key)!r}: of a controller's file a comparison takes "
@@ -85,7 +90,7 @@ def _controller(name: str) -> Job:
         controllers.maker(named.controller)
     if named.execution not in {None, EXACT}:
         controllers.maker(str(named.execution), controllers.EXECUTION)
-    return named.model_dump(include=set(told if named.settings else told[:2]), exclude_none=True)
+    return named.model_dump(include=set(told if named.settings else WHO), exclude_none=True)
 
 
 def _spelt(name: str) -> dict[str, Any]:
@@ -101,33 +106,69 @@ def _spelt(name: str) -> dict[str, Any]:
 def label(job: Job) -> str:
     """What a controller is called in figures: by its name, with its execution's and the settings that it was given."""
     given = ", ".join(f"{name}={value}" for name, value in flat(job.get("settings", {})).items())
-    name = "/".join(job[each] for each in ("controller", "execution") if each in job)
+    name = "/".join(job[each] for each in WHO if each in job)
     return f"{name} ({given})" if given else name
 
 
 def results(wanted: Sequence[Job], workers: int | None, record: Path | None, tick: Callable[[], None]) -> list[Figures]:
     """Measures of every run, or why it has none; what `record` has of them is not run again. Raises ResultError.
 
-    Each is a line of `record` as soon as it is there. A run that failed is tried again the next time.
+    Each is a line of `record` as soon as it is there. A run that failed is tried again the next time, and so is one of
+    which a file has changed since, whose old line stays.
     """
     known = {} if record is None else read(record)
-    todo = [job for job in wanted if campaign.FAILED in known.get(_key(job), {campaign.FAILED: ""})]
+    lines = opened(wanted)
+    todo = [line for line in lines if campaign.FAILED in known.get(_key(line), {campaign.FAILED: ""})]
     for _ in range(len(wanted) - len(todo)):
         tick()
     with campaign.started(workers) as start:
-        started = {start(job): job for job in todo}
+        started = {start(line["job"]): line for line in todo}
         for future in as_completed(started):
-            job, result = started[future], future.result()
-            known[_key(job)] = result
+            line, result = started[future], future.result()
+            known[_key(line)] = result
             if record is not None:
                 with record.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"job": job, "result": result}) + "\n")
+                    file.write(json.dumps({**line, "result": result}) + "\n")
             tick()
-    return [known[_key(job)] for job in wanted]
+    return [known[_key(line)] for line in lines]
+
+
+def opened(wanted: Sequence[Job]) -> list[dict[str, Any]]:
+    """What the line of each run begins with: its settings, and what is in the files that they name, by SHA-256.
+
+    Those are the net's with what goes with it beside it, the ones that a .sumocfg names, and those of classes of one's
+    own; not what such files read themselves.
+    """
+    nets = {net: _digest(_net_files(net)) for net in {job["net"] for job in wanted}}
+    named = {job[role] for job in wanted for role in WHO if role in job}
+    own = {name: _digest([Path(name.rpartition(":")[0])]) for name in named if ".py:" in name}
+    return [
+        {
+            "job": job,
+            "inputs": {"net": nets[job["net"]], **{role: own[job[role]] for role in WHO if job.get(role) in own}},
+        }
+        for job in wanted
+    ]
+
+
+def _net_files(net: str) -> list[Path]:
+    found, net_file = [], Path(net)
+    if net.endswith(SUFFIX):
+        chosen = case.read(Path(net))
+        found, net_file = [chosen.file, *chosen.files], chosen.net_file
+    elif net in utn_network.names():
+        net_file = utn_network.net_file(net)
+    beside = (net_file.with_name(stem(net_file) + ending) for ending in (TURNS, FITTED))
+    return [*(found or [net_file]), *(path for path in beside if path.is_file())]
+
+
+def _digest(files: Sequence[Path]) -> str:
+    return hashlib.sha256("".join(map(case.digest, files)).encode()).hexdigest()
 
 
 def read(record: Path) -> dict[str, Figures]:
-    """Results by job from a record, the last one where there are several; a line that a halt cut short is taken off.
+    """Results by job and inputs from a record, the last one where there are several; a line that a halt cut short is
+    taken off. Lines without inputs, as were written once, are of nobody knows which files, and match no run.
 
     Raises ResultError, and leaves a file alone that is something else.
     """
@@ -141,7 +182,7 @@ def read(record: Path) -> dict[str, Figures]:
     try:
         for line in whole.splitlines():
             entry = json.loads(line)
-            known[_key(entry["job"])] = entry["result"]
+            known[_key({"job": entry["job"], "inputs": entry.get("inputs")})] = entry["result"]
         if not (torn.startswith(OPENING) or OPENING.startswith(torn)):
             raise ValueError(torn)  # noqa: TRY301 - one remedy for all
     except (ValueError, KeyError, TypeError) as error:
@@ -151,8 +192,8 @@ def read(record: Path) -> dict[str, Figures]:
     return known
 
 
-def _key(job: Job) -> str:
-    return json.dumps(job, sort_keys=True)
+def _key(said: Any) -> str:
+    return json.dumps(said, sort_keys=True)
 
 
 def figures(wanted: Sequence[Job], found: Sequence[Figures]) -> list[Figures]:

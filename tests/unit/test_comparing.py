@@ -14,6 +14,7 @@ from scipy import stats
 
 import comparing
 import showing
+from tests.integration import odd_nets
 from utn_sumo import campaign
 from utn_sumo.errors import ResultError, SettingError, UtnError
 
@@ -221,10 +222,15 @@ def test_what_can_not_be_run_is_named_before_anything_is(given: dict[str, Any], 
         comparing.jobs(**usual | given)
 
 
+def recorded(jobs: list[dict[str, Any]], found: list[dict[str, Any]]) -> list[str]:
+    """The lines of a record."""
+    return [json.dumps({**line, "result": each}) for line, each in zip(comparing.opened(jobs), found, strict=True)]
+
+
 def test_what_a_record_holds_is_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs, found = runs(mine=[10, 12], other=[20, 24])
     record = tmp_path / "runs.jsonl"
-    lines = [json.dumps({"job": job, "result": each}) for job, each in zip(jobs, found, strict=True)]
+    lines = recorded(jobs, found)
     record.write_text("\n".join(reversed(lines)) + "\n", encoding="utf-8")
     monkeypatch.setattr(campaign, "_alone", lambda _: pytest.fail("nothing is left to run"))
     assert comparing.results(jobs, 1, record, lambda: None) == found
@@ -234,13 +240,51 @@ def test_what_a_record_holds_is_not_run_again(tmp_path: Path, monkeypatch: pytes
 def test_a_line_that_was_cut_short_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs, found = runs(mine=[10, 12])
     record = tmp_path / "runs.jsonl"
-    lines = [json.dumps({"job": job, "result": each}) for job, each in zip(jobs, found, strict=True)]
+    lines = recorded(jobs, found)
     record.write_text(lines[0] + "\n" + lines[1][:30], encoding="utf-8")
     started: list[Any] = []
     monkeypatch.setattr(campaign, "_alone", lambda job: started.append(job) or result(12))
     assert comparing.results(jobs, 1, record, lambda: None) == found
     assert started == [jobs[1]]
     assert record.read_text(encoding="utf-8").splitlines() == lines
+
+
+@pytest.mark.parametrize("changed", ["odd.sumocfg", "odd.rou.xml", "net.net.xml", "net.turns.xml", "own.py"])
+def test_what_was_made_from_files_that_have_changed_is_run_again_and_stays_on_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
+) -> None:
+    odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    odd_nets.case(tmp_path, odd_nets.traffic("C"))
+    own = tmp_path / "own.py"
+    own.write_text("class Mine:\n    pass\n", encoding="utf-8")
+    job = {"net": str(tmp_path / "odd.sumocfg"), "demand": 1.0, "controller": f"{own}:Mine", "seed": 1}
+    utn17 = {"net": "utn17", "demand": 1.0, "controller": "fixed", "seed": 1}
+    record, started = tmp_path / "runs.jsonl", []
+    monkeypatch.setattr(campaign, "_alone", lambda job: started.append(job) or result(10 * len(started)))
+
+    def delays() -> list[float]:
+        found = comparing.results([utn17, job], 1, record, lambda: None)
+        return [each["total_delay_veh_h"] for each in found]
+
+    assert delays() == delays() == [10, 20]
+    file = tmp_path / changed
+    before = file.read_bytes() if file.exists() else None
+    file.write_bytes((before or b"<edgeRelations/>") + b"\n")
+    assert delays() == delays() == [10, 30]
+    assert started == [utn17, job, job]
+    if before is not None:
+        file.write_bytes(before)
+        assert delays() == [10, 20]
+
+
+def test_a_line_that_does_not_tell_its_files_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs, found = runs(mine=[10])
+    record = tmp_path / "runs.jsonl"
+    line = json.dumps({"job": jobs[0], "result": found[0]})
+    record.write_text(line + "\n", encoding="utf-8")
+    monkeypatch.setattr(campaign, "_alone", lambda _: result(12))
+    assert comparing.results(jobs, 1, record, lambda: None) == [result(12)]
+    assert record.read_text(encoding="utf-8").splitlines()[0] == line
 
 
 @pytest.mark.parametrize("content", ["precious", "precious\n", '{"a": 1}\n', "[]\n", "\xff\xfe"])
