@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tests.integration import odd_nets
 from tests.unit.views import by_the_line, scene
 from utn_controllers.scheduled.execution import Scheduled
-from utn_controllers.scheduled.gaps import Gaps, Giving, let_go
+from utn_controllers.scheduled.gaps import GAP_S, HEADWAY_S, Gaps, Giving, clear, headways, let_go
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.contract import Network
@@ -77,6 +77,37 @@ def test_where_such_a_lane_stands_nobody_goes_as_long_as_there_is_a_queue_toward
 
 def test_lanes_without_others_beside_them_go_on_average_however_they_have_gone() -> None:
     assert queues(0.2, 6.0, flowing=0.0) == queues(0.2, 6.0)
+
+
+@pytest.mark.parametrize("rate_veh_s", [0.02, 0.1, 0.3, 0.6])
+def test_who_waits_does_so_until_the_first_gap_that_lasts(rate_veh_s: float) -> None:
+    rng, waits_s = np.random.default_rng(1), []
+    for _ in range(5000):
+        waited_s = 0.0
+        while (gap_s := rng.exponential(1 / rate_veh_s)) < GAP_S:
+            waited_s += gap_s
+        waits_s.append(waited_s)
+    assert headways(rate_veh_s * GAP_S) * HEADWAY_S == pytest.approx(np.mean(waits_s), rel=0.1)
+
+
+def test_nobody_waits_without_oncoming_traffic_and_for_ever_where_it_never_ends() -> None:
+    assert headways(0.0) == 0
+    assert headways(1e3) == np.inf
+
+
+@given(pace=st.floats(0.0, 1.0), queued_veh=st.floats(0.0, 9.0), lanes=st.integers(1, 3))
+def test_two_of_a_lane_that_stands_for_a_gap_go_as_its_green_ends_and_none_of_one_that_goes(
+    pace: float, queued_veh: float, lanes: int
+) -> None:
+    gaps = Gaps(
+        np.array([[0.3, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.array([True]), np.array([[False, False]]),
+        np.ones((1, 2)), 2.0,
+    )  # fmt: skip
+    veh, amid, going = np.array([queued_veh, 5.0]), np.ones(2), np.array([[0, 1, -1]])
+    clear(0, veh, np.full(2, float(lanes)), going, gaps, np.array([pace, 0.0]), amid)
+    assert amid[0] == pytest.approx(min(2 * lanes * (1 - pace), queued_veh))
+    assert (amid[1], veh[1]) == (0, 5)
+    assert veh[0] + amid[0] == pytest.approx(queued_veh)
 
 
 @given(come=st.floats(0.0, 1.0), more=st.floats(0.01, 0.5), share=st.floats(0.1, 0.9))

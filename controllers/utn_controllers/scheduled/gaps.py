@@ -1,8 +1,11 @@
 """Who has green and must give way to what comes towards him: he goes in its gaps.
 
-While the queue towards him goes there are none. Then the fewer come the more there are, as with Poisson traffic in
-which each gap must last some time (the Highway Capacity Manual's permitted turns), so that a green is worth most when
-it has lasted. Behind who waits stand all on his lane: it goes by as much faster as fewer of it wait.
+How long he waits for one is Adams' (1936) for Poisson traffic in which a gap must last some time: the longer the more
+come, so that a green is worth most when it has lasted. Behind who waits stand all on his lane: it goes by as much
+faster as fewer of it wait.
+
+Who waits does so amid the junction, and clears it when the green ends, and who is behind him with the yellow: where
+nobody finds a gap, that is all who go (the Highway Capacity Manual's sneakers), and the more greens the more.
 
 With other lanes beside it that average will not do: a lane goes until the first who waits comes to its front, then it
 stands while the others go, and a green that is kept for what it would let go on average is kept for long. Which lanes
@@ -19,15 +22,25 @@ import numpy as np
 
 from utn_controllers.scheduled.standstill import Shown
 from utn_controllers.scheduled.streams import Streams
-from utn_controllers.scheduled.yielding import MEMORY_S, START_S
+from utn_controllers.scheduled.yielding import START_S
 from utn_sumo.clearances import GIVES_WAY, HAS_WAY
-from utn_sumo.compiling import compiled
+from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
 ALL = 0.95
 """Who discharges at so much of what he can has a queue."""
 GAP_S = 4.0
 """How long there must be nobody: what drivers take, and SUMO's."""
+SEEN_S = 5.0
+"""Over how much green it is seen whether a lane stands: of a queue that goes somebody leaves it every two seconds."""
+HEADWAY_S = 2.0
+"""Between two who leave a lane of a queue."""
+NO_GAP_VEH = 20.0
+"""With so many coming while a gap must last there is none."""
+SOME_VEH = 1e-3
+"""With fewer than so many nobody waits for one."""
+AMID_VEH = 2.0
+"""Of a lane on which somebody waits, as its green ends: they go with the yellow, as in the Highway Capacity Manual."""
 
 
 class Gaps(NamedTuple):
@@ -91,7 +104,7 @@ class Giving:
         """(J,) when that was."""
         self._left_veh = np.zeros(len(network.lane_sets))
         """(L,) who had left by then."""
-        self._is_needed = bool(self.gaps.beside.any()) and any(foes.values())
+        self._is_needed = any(foes.values())
 
     def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats) -> None:
         """Take up how fast those go who have green before the junctions `asked` (J,); as Yielding.look."""
@@ -144,7 +157,7 @@ def _see(
             flowing[lane_set] = 1.0
         elif since_s > 0:
             gone = min((left[lane_set] - before[lane_set]) / (flow[lane_set] * since_s), 1.0)
-            flowing[lane_set] += min(since_s / MEMORY_S, 1.0) * (gone - flowing[lane_set])
+            flowing[lane_set] += min(since_s / SEEN_S, 1.0) * (gone - flowing[lane_set])
         queued[lane_set] = near[lane_set] >= 1
         before[lane_set] = left[lane_set]
     for junction in range(len(asked)):
@@ -161,8 +174,8 @@ def let_go(
 ) -> None:  # fmt: skip
     """Brings the vehicles `veh` (n,) of those who have green in a stage, the `row`, up to the end of a bin.
 
-    `pace` (n,) is which share of their discharge those have who wait for gaps, kept from bin to bin of a green: 1
-    before its first; `free` (n,) which share of their lanes has nobody in front who waits for one, with others beside
+    `pace` (n,) is which share of their discharge those have who wait for gaps, kept from bin to bin of a green (see
+    `begin_green`); `free` (n,) which share of their lanes has nobody in front who waits for one, with others beside
     them: every vehicle that goes brings somebody there. `want` (n,) is room for who would go.
     """
     place = 0
@@ -183,7 +196,7 @@ def let_go(
                 if beside and gaps.waiting[row, other] == 0 and want[other] >= ALL * moves[row, other] * most[other]:
                     towards = np.inf
                 foe += 1
-            found = min(np.exp(-gaps.per_veh * towards) / share, 1.0)
+            found = 1 / (1 + share * headways(gaps.per_veh * towards))
             pace[stream] = free[stream] + (1 - free[stream]) * found if beside else found
             goes = moves[row, stream] * pace[stream]
             if most[stream] > 0:
@@ -193,3 +206,39 @@ def let_go(
         else:
             veh[stream] -= want[stream]
         place += 1
+
+
+@compiled
+def headways(come_veh: float) -> float:
+    """How long somebody waits for a gap, in headways, if so many come while one must last (Adams 1936)."""
+    if come_veh < SOME_VEH:
+        return 0.0
+    if come_veh > NO_GAP_VEH:
+        return np.inf
+    return float(GAP_S / HEADWAY_S * (np.exp(come_veh) - come_veh - 1) / come_veh)
+
+
+@compiled
+def clear(
+    row: int, veh: Floats, most: Floats, going: Ints, gaps: Gaps, pace: Floats, amid: Floats
+) -> None:  # fmt: skip
+    """Takes from the vehicles `veh` (n,) those who wait for gaps as a green ends, and puts them into `amid` (n,)."""
+    place = 0
+    while going[row, place] >= 0:
+        stream = going[row, place]
+        amid[stream] = 0.0
+        if gaps.waiting[row, stream] > 0:
+            amid[stream] = min(AMID_VEH * (1 - pace[stream]) * most[stream], veh[stream])
+            veh[stream] -= amid[stream]
+        place += 1
+
+
+@inlined
+def begin_green(row: int, gaps: Gaps, is_shown: bool, pace: Floats, free: Floats) -> None:
+    """Sets `pace` and `free` (n,) of `let_go` for a green that begins, or that is shown already and goes on."""
+    pace[:], free[:] = 1.0, 1.0
+    if is_shown:
+        free[:] = gaps.flowing[row, : len(free)]
+        for stream in range(len(pace)):
+            if gaps.waiting[row, stream] > 0:
+                pace[stream] = free[stream]

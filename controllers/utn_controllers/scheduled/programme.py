@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.scheduled.gaps import Gaps, let_go
+from utn_controllers.scheduled.gaps import Gaps, begin_green, clear, let_go
 from utn_controllers.scheduled.moves import Rules
 from utn_controllers.scheduled.traffic import Traffic
 from utn_sumo.compiling import compiled, inlined
@@ -142,7 +142,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
     after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     others, veh = np.empty(stages, np.int64), np.empty(streams)
-    pace, free, want = np.ones(streams), np.ones(streams), np.zeros(streams)
+    pace, free, want, amid = np.ones((4, streams))
     stood, left = np.empty((2, stages + 1))
     for begin in range(bins):
         for stage in range(stages):
@@ -165,9 +165,8 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     lose = 0 if clearing[row, other] >= 0 else min(lose, clearance[row, other])
             may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
             now, goes = begin, True
-            pace[:], free[:] = 1.0, 1.0
-            if gaps is not None and begin == 0:
-                free[:] = gaps.flowing[row, :streams]
+            if gaps is not None:
+                begin_green(row, gaps, begin == 0, pace, free)
             while now < bins:
                 if spent + _held(stage, grown, paid, now, min(now + lose, bins), held) >= best - ALIKE:
                     break
@@ -175,12 +174,17 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 if now >= may_end and (goes or now == may_end):
                     # It ends here: others begin after their clearance, where that is the best way there.
                     won, won_in = 0.0, -1
+                    stays = held + moving
+                    if gaps is not None:
+                        clear(row, veh, most, going, gaps, pace, amid)
+                        for place in range(greens):
+                            stays -= worth[going[row, place]] * amid[going[row, place]]
                     for place in range(nexts):
                         other = others[place]
                         opens = min(now + clearance[row, other], bins)
                         if spent >= rank[opens, other] - ALIKE:
                             continue
-                        until = spent + _held(stages, grown, paid, now, opens, held + moving)
+                        until = spent + _held(stages, grown, paid, now, opens, stays)
                         if opens == bins:
                             until += left[stages] + due[stages, bins]
                             for nth in range(greens):
@@ -222,6 +226,9 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                                     begin, now, opens, row, clearing[row, other], moves, going, come, came, most, veh,
                                     queue[opens, other],
                                 )  # fmt: skip
+                    if gaps is not None:
+                        for place in range(greens):
+                            veh[going[row, place]] += amid[going[row, place]]
                 if now >= must_end:
                     break
                 spent += _held(stage, grown, paid, now, now + 1, held)
@@ -422,20 +429,21 @@ def _send_off(
 @compiled
 def _let_all_go(plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats, most: Floats, sent: Floats) -> None:
     """Fills `sent` (n, K) as `_send_off` where somebody waits for gaps: bin by bin, from the vehicles `veh` (n,) on."""
-    pace, free, want = np.ones(len(veh)), np.ones(len(veh)), np.zeros(len(veh))
+    pace, free, want, amid = np.ones((4, len(veh)))
+    before = -1
     for place, row in enumerate(plan):
+        sent[:, place] = veh + come[:, place]
         green = 0 <= row < len(gaps.some)
-        if place == 0 or plan[place - 1] != row:
-            pace[:], free[:] = 1.0, 1.0
-            if place == 0 and green:
-                free[:] = gaps.flowing[row, : len(veh)]
+        if row != before:
+            if 0 <= before < len(gaps.some):
+                clear(before, veh, most, rules.going, gaps, pace, amid)
+            if green:
+                begin_green(row, gaps, place == 0, pace, free)
         for stream in range(len(veh)):
             share = rules.moves[row, stream] if row >= 0 else 0.0
-            there = veh[stream] + come[stream, place]
-            sent[stream, place] = there
             if not (green and share > 0):
-                veh[stream] = max(there - share * most[stream], 0.0)
+                veh[stream] = max(veh[stream] + come[stream, place] - share * most[stream], 0.0)
         if green:
             let_go(row, place, veh, come, most, rules.moves, rules.going, gaps, pace, free, want)
-        for stream in range(len(veh)):
-            sent[stream, place] -= veh[stream]
+        sent[:, place] -= veh
+        before = row
