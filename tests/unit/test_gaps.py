@@ -36,6 +36,7 @@ def queues(
     gaps = Gaps(
         np.array([[waiting, 0.0]]),
         np.array([[[1, -1], [-1, -1]]]),
+        np.full((1, 2), 2.0),
         np.array([True]),
         np.array([[beside, False]]),
         np.ones((1, 2)),
@@ -100,8 +101,8 @@ def test_two_of_a_lane_that_stands_for_a_gap_go_as_its_green_ends_and_none_of_on
     pace: float, queued_veh: float, lanes: int
 ) -> None:
     gaps = Gaps(
-        np.array([[0.3, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.array([True]), np.array([[False, False]]),
-        np.ones((1, 2)), 2.0,
+        np.array([[0.3, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.full((1, 2), 2.0), np.array([True]),
+        np.array([[False, False]]), np.ones((1, 2)), 2.0,
     )  # fmt: skip
     veh, amid, going = np.array([queued_veh, 5.0]), np.ones(2), np.array([[0, 1, -1]])
     clear(0, veh, np.full(2, float(lanes)), going, gaps, np.array([pace, 0.0]), amid)
@@ -135,12 +136,18 @@ def test_left_turns_without_a_stage_of_their_own_wait_for_who_comes_straight_on(
     assert gaps.some.any()
 
 
+def test_nobody_counts_as_gone_with_his_green_where_he_goes_on_while_who_walks_is_cleared(street_of: StreetOf) -> None:
+    for make, goes_on in ((odd_nets.pedestrians, True), (odd_nets.plain, False)):
+        gaps = Scheduled(street_of(make))._giving.gaps
+        assert (gaps.waiting > 0).any()
+        assert (gaps.amid_veh[gaps.waiting > 0] == (0.0 if goes_on else 2.0)).all()
+
+
 def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(street_of: StreetOf) -> None:
     network = street_of(odd_nets.two_lanes)
     streams, stages = Streams(network), network.junctions[0].stages
-    giving = Giving(
-        network, streams, np.zeros((len(stages), len(network.lane_sets)), dtype=bool), 2.0, len(streams.link)
-    )
+    learnt, held = (np.zeros((len(stages), count), dtype=bool) for count in (len(network.lane_sets), len(streams.link)))
+    giving = Giving(network, streams, learnt, 2.0, held)
     giving.take_up(streams.shares(network.fraction).way_of_set)
     rows, everywhere = np.argsort(streams.stage), np.ones(1, dtype=bool)
     waiting, seen = by_the_line(np.full(len(network.lane_sets), 5.0)), []

@@ -49,6 +49,8 @@ class Crossing:
     """Share of its discharge that a stream has in another's stage."""
     waits: dict[tuple[int, int], float] = field(default_factory=dict)
     """Share of a stream that waits in a stage for gaps in the others that it serves."""
+    amid_veh: float = 2.0
+    """That go of each lane on which somebody waits as its green ends."""
     flowing: float = 1.0
     """Share of their discharge that all lanes have had of late in the stage that is shown."""
     staying: float = 5.0
@@ -96,7 +98,13 @@ class Crossing:
             waiting[stage, stream] = share * (moves[stage, stream] > 0)
             foes[stage, stream, : len(others)] = others
         gaps = Gaps(
-            waiting, foes, (waiting > 0).any(axis=1), np.zeros(shape, dtype=np.bool_), np.full(shape, self.flowing), 2.0
+            waiting,
+            foes,
+            np.full(shape, self.amid_veh),
+            (waiting > 0).any(axis=1),
+            np.zeros(shape, dtype=np.bool_),
+            np.full(shape, self.flowing),
+            2.0,
         )
         return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least), gaps)
 
@@ -579,6 +587,7 @@ class TestMoves:
                 if turns
             )
             rows = moves.share[moves.row[row, then] : moves.row[row, then] + moves.bins[row, then]]
+            assert (moves.held[row] >= (rows[0] > 0)).all()
             served = np.flatnonzero(streams.serves[row, a : streams.first[network.stages[stage].junction + 1]])
             assert 2 * rows[:, served].sum(axis=0).max() == pytest.approx(open_s)
 

@@ -79,7 +79,7 @@ class Scheduled:
         self._calling = Calling(network, self._streams)
         moves = Moves(network, self._calling, BIN_S)
         self._yielding = Yielding(network, self._streams, moves.share)
-        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, moves.share.shape[1])
+        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, moves.held)
         self._rules = Rules(
             stages,
             self._streams.first_stage,

@@ -50,6 +50,8 @@ class Gaps(NamedTuple):
     """(S, most streams of a junction) share of its lane set that waits for gaps: 0 where nobody does."""
     foes: Ints
     """(S, most streams of a junction, most foes + 1) streams of the junction in whose gaps it goes, then -1."""
+    amid_veh: Floats
+    """(S, most streams of a junction) of each lane, that go as the green ends if somebody waits then."""
     some: Bools
     """(S,) whether anybody waits for gaps."""
     beside: Bools
@@ -63,8 +65,8 @@ class Gaps(NamedTuple):
 class Giving:
     """Keeps which share of each lane set waits for gaps."""
 
-    def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, most: int):
-        """But for lane sets whose discharge in a stage is `learnt` (S, L). No junction has more than `most` streams."""
+    def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, held: Bools):
+        """But for lane sets whose discharge in a stage is `learnt` (S, L). Who is `held`, as in Moves, goes on anyway."""
         self._streams = streams
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
         """(S, V) signalled ways that wait for gaps in a stage."""
@@ -79,10 +81,11 @@ class Giving:
                     own = _foes(network, streams, row, int(stage), way)
                     self._waits[row, way] = len(own) > 0
                     foes.setdefault((row, int(streams.lane_set[stream])), set()).update(own)
-        shape, most_foes = (len(streams.stage), most), max((len(own) for own in foes.values()), default=0)
+        shape, most_foes = held.shape, max((len(own) for own in foes.values()), default=0)
         self.gaps = Gaps(
             waiting=np.zeros(shape),
             foes=np.full((*shape, most_foes + 1), -1),
+            amid_veh=np.where(held, 0.0, AMID_VEH),
             some=np.zeros(shape[0], dtype=np.bool_),
             beside=np.zeros(shape, dtype=np.bool_),
             flowing=np.ones(shape),
@@ -228,7 +231,7 @@ def clear(
         stream = going[row, place]
         amid[stream] = 0.0
         if gaps.waiting[row, stream] > 0:
-            amid[stream] = min(AMID_VEH * (1 - pace[stream]) * most[stream], veh[stream])
+            amid[stream] = min(gaps.amid_veh[row, stream] * (1 - pace[stream]) * most[stream], veh[stream])
             veh[stream] -= amid[stream]
         place += 1
 

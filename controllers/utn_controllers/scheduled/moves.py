@@ -77,6 +77,10 @@ class Moves:
         """(R, most streams of a junction)."""
         for number, row in enumerate(rows):
             self.share[number, : len(row)] = row
+        self.held = np.zeros((len(owner), self.share.shape[1]), dtype=np.bool_)
+        """(S, most streams of a junction) those that still move in the first bin of some clearance from a stage."""
+        for begins in self.row.T:
+            self.held |= (begins >= 0)[:, None] & (self.share[begins] > 0)
         self.going = going(self.share, len(owner), self.row, self.bins)
         """(R, most streams of a junction + 1) as in `Rules`."""
 
