@@ -66,7 +66,7 @@ class Giving:
     """Keeps which share of each lane set waits for gaps."""
 
     def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, held: Bools):
-        """But for lane sets whose discharge in a stage is `learnt` (S, L). Who is `held`, as in Moves, goes on anyway."""
+        """But for lane sets whose discharge in a stage is `learnt` (S, L). Who is `held`, as in Moves, goes on."""
         self._streams = streams
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
         """(S, V) signalled ways that wait for gaps in a stage."""
