@@ -33,6 +33,8 @@ GAP_S = 4.0
 """How long there must be nobody: what drivers take, and SUMO's."""
 SEEN_S = 5.0
 """Over how much green it is seen whether a lane stands: of a queue that goes somebody leaves it every two seconds."""
+STANDING = 0.25
+"""Who has way and goes at less than so much of what he can stands behind something."""
 HEADWAY_S = 2.0
 """Between two who leave a lane of a queue."""
 NO_GAP_VEH = 20.0
@@ -238,10 +240,13 @@ def clear(
 
 @inlined
 def begin_green(row: int, gaps: Gaps, is_shown: bool, pace: Floats, free: Floats) -> None:
-    """Sets `pace` and `free` (n,) of `let_go` for a green that begins, or that is shown already and goes on."""
+    """Sets `pace` and `free` (n,) of `let_go` for a green that begins, or that is shown already and goes on.
+
+    Then those who have way and stand, behind a road that is full, do not go either.
+    """
     pace[:], free[:] = 1.0, 1.0
     if is_shown:
         free[:] = gaps.flowing[row, : len(free)]
         for stream in range(len(pace)):
-            if gaps.waiting[row, stream] > 0:
+            if gaps.waiting[row, stream] > 0 or free[stream] < STANDING:
                 pace[stream] = free[stream]
