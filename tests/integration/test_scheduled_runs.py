@@ -240,17 +240,22 @@ def test_bicycles_on_a_lane_of_their_own_are_served_though_hardly_a_car_calls(
     assert max(waits_s(tmp_path / "out", "bike")) < 200
 
 
-def test_a_lane_that_stands_behind_a_left_turn_does_not_keep_the_main_road_s_green(tmp_path: Path) -> None:
-    odd_nets.row("C", lanes=2).net(tmp_path, odd_nets.NO_TURNAROUNDS)
+def crossing(folder: Path, main_veh_h: tuple[int, ...], side_veh_h: tuple[int, ...], end_s: int) -> Path:
+    """Two lanes a road, left turns in gaps; from each arm of both roads so many straight on and to either side."""
+    odd_nets.row("C", lanes=2).net(folder, odd_nets.NO_TURNAROUNDS)
     ways = {"W": ("E", "nC", "sC"), "E": ("W", "sC", "nC"), "nC": ("sC", "E", "W"), "sC": ("nC", "W", "E")}
-    # Of the main road 15 % turn left, from the inner of its two lanes.
     flows = "".join(
-        f'<flow id="{arm}{end}" begin="0" end="2400" period="exp({rate / 3600:.6f})" departLane="best" '
+        f'<flow id="{arm}{end}" begin="0" end="{end_s}" period="exp({rate / 3600:.6f})" departLane="best" '
         f'departSpeed="max" from="{arm}-C" to="C-{end}"/>'
         for arm, ends in ways.items()
-        for end, rate in zip(ends, (805, 172, 172) if arm in "WE" else (175, 38, 38), strict=True)
+        for end, rate in zip(ends, main_veh_h if arm in "WE" else side_veh_h, strict=True)
     )
-    file = odd_nets.case(tmp_path, flows, end="2400")
+    return odd_nets.case(folder, flows, end=str(end_s))
+
+
+def test_a_lane_that_stands_behind_a_left_turn_does_not_keep_the_main_road_s_green(tmp_path: Path) -> None:
+    # Of the main road 15 % turn left, from the inner of its two lanes.
+    file = crossing(tmp_path, main_veh_h=(805, 172, 172), side_veh_h=(175, 38, 38), end_s=2400)
     results = {
         controller: bridge.run(scenario(net=str(file), controller=controller, seed=5), tmp_path / controller)
         for controller in ("actuated", "recommended")
@@ -260,16 +265,8 @@ def test_a_lane_that_stands_behind_a_left_turn_does_not_keep_the_main_road_s_gre
 
 
 def test_left_turns_that_only_go_as_their_green_ends_have_greens_enough(tmp_path: Path) -> None:
-    odd_nets.row("C", lanes=2).net(tmp_path, odd_nets.NO_TURNAROUNDS)
-    ways = {"W": ("E", "nC", "sC"), "E": ("W", "sC", "nC"), "nC": ("sC", "E", "W"), "sC": ("nC", "W", "E")}
     # Near what it can take: a fifth turn left, and as many right.
-    flows = "".join(
-        f'<flow id="{arm}{end}" begin="0" end="1800" period="exp({rate / 3600:.6f})" departLane="best" '
-        f'departSpeed="max" from="{arm}-C" to="C-{end}"/>'
-        for arm, ends in ways.items()
-        for end, rate in zip(ends, (560, 186, 186) if arm in "WE" else (390, 130, 130), strict=True)
-    )
-    file = str(odd_nets.case(tmp_path, flows, end="1800"))
+    file = str(crossing(tmp_path, main_veh_h=(560, 186, 186), side_veh_h=(390, 130, 130), end_s=1800))
     delay = delays_s(file, ("max_pressure", "recommended"), tmp_path)
     # Where schedules thought that they would go soon, they had 1.16 of what the rule has.
     assert delay["recommended"] < delay["max_pressure"]
