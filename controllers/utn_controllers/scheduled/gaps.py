@@ -11,6 +11,9 @@ With other lanes beside it that average will not do: a lane goes until the first
 stands while the others go, and a green that is kept for what it would let go on average is kept for long. Which lanes
 stand in the present green is seen by who has left them.
 
+So it is behind a short road that is full, as between the two signals of a dual carriageway: who would go onto it stands
+in the way of his lane, and it empties in the next green, so that what can't go in this one may go in the one after.
+
 Where another stage of the junction has a lane set to itself, yielding.py has learnt what it does.
 """
 
@@ -20,12 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from utn_controllers.scheduled.standstill import Shown
+from utn_controllers.scheduled.standstill import ROOM, Shown
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.yielding import START_S
 from utn_sumo.clearances import GIVES_WAY, HAS_WAY
 from utn_sumo.compiling import compiled, inlined
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 ALL = 0.95
 """Who discharges at so much of what he can has a queue."""
@@ -35,6 +38,8 @@ SEEN_S = 5.0
 """Over how much green it is seen whether a lane stands: of a queue that goes somebody leaves it every two seconds."""
 STANDING = 0.25
 """Who has way and goes at less than so much of what he can stands behind something."""
+SHORT_VEH = 6.0
+"""A road that holds fewer a lane empties in one green: on longer ones what goes now says less of what will."""
 HEADWAY_S = 2.0
 """Between two who leave a lane of a queue."""
 NO_GAP_VEH = 20.0
@@ -59,7 +64,8 @@ class Gaps(NamedTuple):
     beside: Bools
     """(S, most streams of a junction) whether there are lanes beside its own that move in another way."""
     flowing: Floats
-    """(S, most streams of a junction) share of its discharge that its lanes have in the stage that is shown."""
+    """(S, most streams of a junction) share of its discharge that it is thought to have in the stage that is shown: as
+    its lanes have had of late where somebody waits or stands, otherwise all."""
     per_veh: float
     """By what power of e fewer go for each vehicle in a bin that comes towards them."""
 
@@ -110,15 +116,19 @@ class Giving:
         self._left_veh = np.zeros(len(network.lane_sets))
         """(L,) who had left by then."""
         self._is_needed = any(foes.values())
+        lanes = np.array([link.lanes for link in network.links])
+        self._full_veh = np.where(network.storage_veh < SHORT_VEH * lanes, ROOM * network.storage_veh, np.inf)
+        """(Z,) vehicles on a short link with which it may be full."""
 
     def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats) -> None:
         """Take up how fast those go who have green before the junctions `asked` (J,); as Yielding.look."""
         if self._is_needed:
             network, streams = self._network, self._streams
             _see(
-                view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0],
+                view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0], view.x_veh >= self._full_veh,
                 network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._flowing,
-                self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.first, self.gaps.flowing,
+                self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.next_link, streams.first,
+                self.gaps,
             )  # fmt: skip
 
     def take_up(self, of_set: Floats) -> None:
@@ -150,10 +160,14 @@ def _foes(network: Network, streams: Streams, row: int, stage: int, way: int) ->
 
 @compiled
 def _see(
-    time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, flow: Floats,
-    set_junction: Ints, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats, stream_set: Ints,
-    first: Ints, shown: Floats,
+    time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, full: Bools,
+    flow: Floats, set_junction: Ints, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats,
+    stream_set: Ints, next_link: Ints, first: Ints, gaps: Gaps,
 ) -> None:  # fmt: skip
+    behind = np.zeros(len(flowing), np.bool_)
+    for stream, ahead in enumerate(next_link):
+        if ahead != EXIT:
+            behind[stream_set[stream]] |= full[ahead]
     for lane_set, junction in enumerate(set_junction):
         if not asked[junction]:
             continue
@@ -168,8 +182,11 @@ def _see(
     for junction in range(len(asked)):
         if asked[junction]:
             looked_s[junction] = time_s
+            row = present[junction]
             for stream in range(first[junction], first[junction + 1]):
-                shown[present[junction], stream - first[junction]] = flowing[stream_set[stream]]
+                own, share = stream - first[junction], flowing[stream_set[stream]]
+                stands = gaps.waiting[row, own] > 0 or behind[stream_set[stream]] or share < STANDING
+                gaps.flowing[row, own] = share if stands else 1.0
 
 
 @compiled
@@ -240,13 +257,7 @@ def clear(
 
 @inlined
 def begin_green(row: int, gaps: Gaps, is_shown: bool, pace: Floats, free: Floats) -> None:
-    """Sets `pace` and `free` (n,) of `let_go` for a green that begins, or that is shown already and goes on.
-
-    Then those who have way and stand, behind a road that is full, do not go either.
-    """
+    """Sets `pace` and `free` (n,) of `let_go` for a green that begins, or that is shown already and goes on."""
     pace[:], free[:] = 1.0, 1.0
     if is_shown:
-        free[:] = gaps.flowing[row, : len(free)]
-        for stream in range(len(pace)):
-            if gaps.waiting[row, stream] > 0 or free[stream] < STANDING:
-                pace[stream] = free[stream]
+        pace[:] = free[:] = gaps.flowing[row, : len(free)]
