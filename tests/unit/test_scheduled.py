@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
-from utn_controllers.scheduled.ending import Ending, lost, needing, staying
+from utn_controllers.scheduled.ending import Ending, ahead, lost, needing, staying
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.moves import Moves, Rules, going
@@ -106,7 +106,7 @@ class Crossing:
             np.full(shape, self.flowing),
             2.0,
         )
-        return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least), gaps)
+        return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least), np.array([self.bins]), gaps)
 
     def decide(
         self,
@@ -516,6 +516,13 @@ class TestEnding:
         assert found[0] < found[1] < found[2]
         assert found[2] - found[1] == pytest.approx((12 - 8) * (found[1] - found[0]) / (8 - 4), rel=0.5)
 
+    def test_schedules_go_farther_where_clearances_take_long(self) -> None:
+        assert ahead(25, np.array([0, 4, 9])).tolist() == [25, 25, 25]
+        some, more, most, endless = ahead(25, np.array([10, 16, 30, 300]))
+        assert 25 < some < more < most == endless
+        # Who wants it farther than any has it so.
+        assert ahead(100, np.array([4, 30])).tolist() == [100, 100]
+
     def test_whoever_needs_a_stage_for_himself_has_others_wait_for_him(self) -> None:
         # A main road of two streams beside a left turn, and a side road.
         serves = np.array([[True, True, False, False], [False, False, True, False], [False, False, False, True]])
@@ -544,7 +551,7 @@ class TestEnding:
         come = np.linspace(0.1, 0.4, len(streams.link))
         needed = []
         for times in (0, 1, 2):
-            ending = Ending(streams, times * clearance)
+            ending = Ending(streams, lost(streams.first_stage, times * clearance))
             assert not ending.weights(np.zeros(len(come))).any()
             ending.take_up(come, np.ones(len(come)))
             needed.append(ending.weights(np.zeros(len(come))))

@@ -1,4 +1,6 @@
-"""What it costs to leave somebody there at the end of a schedule: else a change of stages late in it would not pay.
+"""How far a schedule goes, and what it costs to leave somebody there at its end.
+
+Else a change of stages late in it would not pay.
 
 Who is left waits until the schedules after this one, the longer the more time a cycle loses to clearances. And others
 wait for him: letting him go takes time of a stage, in which nobody else's vehicles leave. Where one stream has a lane
@@ -20,14 +22,19 @@ QUICK_BINS, STAYING_OF_LOST = 2, 2.5
 NEEDING_OF_STAYING = 1.4
 """So many times as long as he waits longer than that have others to wait who come while he is let go."""
 
+FAR_BINS, FARTHER, FARTHEST_BINS = 9, 3.0, 60
+"""For each bin more than so many that the clearances of a cycle take, a schedule goes so many farther, up to so many.
+One that ends before each stage has had its turn changes them more often than there is time for, and has those wait of
+whom fewest leave in a bin."""
+
 
 class Ending:
     """Keeps what a vehicle of each stream weighs that is left at a schedule's end."""
 
-    def __init__(self, streams: Streams, clearance: Ints):
-        """`clearance` (S, most stages of a junction) in bins, as in `Rules`."""
+    def __init__(self, streams: Streams, lost_bins: Ints):
+        """`lost_bins` (J,) are those of `lost`."""
         self._streams = streams
-        self.staying_bins = staying(lost(streams.first_stage, clearance))
+        self.staying_bins = staying(lost_bins)
         """(J,) that who is left waits longer."""
         self._staying = np.repeat(self.staying_bins, np.diff(streams.first))
         self._weight = NEEDING_OF_STAYING * (self.staying_bins - LEAST_STAYING_BINS)
@@ -54,6 +61,12 @@ def lost(first_stage: Ints, clearance: Ints) -> Ints:
         for first, size in zip(first_stage[:-1], sizes, strict=True)
     ]
     return np.array(found, dtype=np.int64)
+
+
+def ahead(bins: int, lost_bins: Ints) -> Ints:
+    """(J,) bins that schedules have: so many where the clearances of a cycle take little."""
+    more = FARTHER * np.maximum(lost_bins - FAR_BINS, 0)
+    return np.rint(np.minimum(bins + more, max(FARTHEST_BINS, bins))).astype(np.int64)
 
 
 def staying(lost_bins: Ints) -> Floats:

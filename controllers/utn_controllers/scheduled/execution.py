@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.scheduled.calling import Calling
-from utn_controllers.scheduled.ending import Ending
+from utn_controllers.scheduled.ending import Ending, ahead, lost
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
@@ -37,7 +37,7 @@ class ScheduledSettings(BaseModel):
     bounds: Literal["none", "plan"] = "none"
     """Whether a green lasts no longer than the plan has it where others wait."""
     horizon_s: float = Field(50.0, ge=10, le=200)
-    """How far ahead a schedule goes [s]."""
+    """How far ahead a schedule goes [s], where clearances take little."""
     discharge: float = Field(1.2, gt=0, le=3)
     """Over the saturation flow, which is that of long queues with their start: what a queue leaves with."""
     crowding: float = Field(0.4, ge=0, le=20)
@@ -63,7 +63,10 @@ class Scheduled:
         self.settings = ScheduledSettings(**settings)  # type: ignore[arg-type]
         self.every_s = BIN_S
         self._streams = Streams(network)
-        bins = round(self.settings.horizon_s / BIN_S)
+        self._calling = Calling(network, self._streams)
+        moves = Moves(network, self._calling, BIN_S)
+        lost_bins = lost(self._streams.first_stage, moves.bins)
+        bins = ahead(round(self.settings.horizon_s / BIN_S), lost_bins)
         self._outlook = Outlook(network, self._streams, bins, BIN_S)
         self._worth = Worth(
             network,
@@ -76,8 +79,6 @@ class Scheduled:
         self._parked = Parked(network, self._streams)
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
-        self._calling = Calling(network, self._streams)
-        moves = Moves(network, self._calling, BIN_S)
         self._yielding = Yielding(network, self._streams, moves.share)
         self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, moves.held)
         self._rules = Rules(
@@ -90,12 +91,13 @@ class Scheduled:
             moves.row,
             moves.bins,
             np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
+            bins,
             self._giving.gaps,
         )
-        self._ending = Ending(self._streams, moves.bins)
-        self._plan = np.full((len(network.junctions), bins), -1)
-        """(J, K) the last schedules."""
-        self._sent_veh = np.zeros((len(self._calling.letters), bins))
+        self._ending = Ending(self._streams, lost_bins)
+        self._plan = np.full((len(network.junctions), bins.max()), -1)
+        """(J, K) the last schedules, of each junction as far as they go."""
+        self._sent_veh = np.zeros((len(self._calling.letters), bins.max()))
         """(A, K) what each stream sends off by them."""
         self._row = np.argsort(stages)
         """(S,) row of the rules in which each of the network's stages is."""
@@ -103,7 +105,7 @@ class Scheduled:
         """Junctions whose green is to end at the next decision, and the stage then: who could be led there sooner."""
         self._stopped: dict[tuple[int, int], tuple[int, ...]] = {}
         """Lane sets that have green in one stage and none in another, of those that it was asked for."""
-        self._endless = np.full(len(network.junctions), bins)
+        self._endless = bins
         self._green_s: Floats | None = None
         self._take_up()
         self._warm_up()

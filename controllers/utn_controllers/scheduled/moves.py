@@ -43,6 +43,8 @@ class Rules(NamedTuple):
     """(S, most stages of a junction) bins of that clearance: one or more."""
     least: Ints
     """(S,) bins of green, one or more."""
+    ahead: Ints
+    """(J,) bins that a schedule has."""
     gaps: Gaps
 
 

@@ -41,6 +41,8 @@ def schedules(
     `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
     weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `most` (N,) that leave in a bin of green.
 
+    Of K bins schedules have as many as the rules say; beyond these `plan` has -1 and `sent` nobody.
+
     `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
     not free, what is left of the last one.
@@ -56,17 +58,20 @@ def schedules(
         while rules.stages[low + present] != stage[junction]:
             present += 1
         stages = rules.first_stage[junction + 1] - low
+        bins = rules.ahead[junction]
+        goes = np.empty((b - a, bins))
         # Two calls: for the compiler None is another type.
         if rules.gaps.some[low : low + stages].any():
             chosen = _schedule(
-                present, rest[junction], low, stages, rules, rules.gaps, stand[a:b], come[a:b], worth[a:b], ends[a:b],
-                most[a:b], plan[junction], sent[a:b],
+                present, rest[junction], low, stages, rules, rules.gaps, stand[a:b], come[a:b, :bins].copy(),
+                worth[a:b], ends[a:b], most[a:b], plan[junction, :bins], goes,
             )  # fmt: skip
         else:
             chosen = _schedule(
-                present, rest[junction], low, stages, rules, None, stand[a:b], come[a:b], worth[a:b], ends[a:b],
-                most[a:b], plan[junction], sent[a:b],
+                present, rest[junction], low, stages, rules, None, stand[a:b], come[a:b, :bins].copy(), worth[a:b],
+                ends[a:b], most[a:b], plan[junction, :bins], goes,
             )  # fmt: skip
+        sent[a:b, :bins] = goes
         wish[junction] = rules.stages[low + chosen]
         then[junction] = wish[junction]
         if chosen == present and plan[junction, 1] != low + present:
