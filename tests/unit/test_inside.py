@@ -99,6 +99,23 @@ def test_nobody_is_held_for_one_vehicle_wherever_it_waits(crossing: Crossing) ->
         assert crossing.inside.holds(0, 23.0) == (sum(turns_veh) > 1.0)
 
 
+def test_before_two_lanes_abreast_it_lasts_for_one_vehicle_too(crossing: Crossing) -> None:
+    network, group = crossing.network, crossing.network.turns[crossing.next_turning[0]].group
+    wide = tuple(replace(each, lanes=(*each.lanes, 9)) if each.group == group else each for each in network.lane_sets)
+    inside = Inside(replace(network, lane_sets=wide), crossing.full())
+    crossing.traffic.inside_veh[crossing.turning[0]] = 1.0
+    inside.leads(0, crossing.through, crossing.across, 23.0)
+    assert inside.holds(0, 23.0)
+
+
+def test_the_red_lasts_before_the_next_road_s_own_stage_for_turns_too(crossing: Crossing) -> None:
+    stages = crossing.network.junctions[0].stages
+    own = stages[(stages.index(crossing.across) + 1) % len(stages)]
+    crossing.full()
+    crossing.inside.leads(0, crossing.through, own, 23.0)
+    assert crossing.inside.holds(0, 23.0)
+
+
 def test_to_the_turns_own_stage_it_is_the_nets_clearance(crossing: Crossing) -> None:
     crossing.full()
     crossing.inside.leads(0, crossing.through, crossing.alone, 23.0)

@@ -106,7 +106,19 @@ class Crossing:
             np.full(shape, self.flowing),
             2.0,
         )
-        return Rules(place, first, first, follows, moves, who, clearing, clearance, np.array(self.least), np.array([self.bins]), gaps)
+        return Rules(
+            place,
+            first,
+            first,
+            follows,
+            moves,
+            who,
+            clearing,
+            clearance,
+            np.array(self.least),
+            np.array([self.bins]),
+            gaps,
+        )
 
     def decide(
         self,

@@ -21,8 +21,8 @@ from utn_sumo.contract import Bools, Junction, Network
 
 MOST_HOLD_S = 7.0
 """Longer the red is not drawn out: who is still there does not get away by it."""
-ALONE_VEH = 1.0
-"""Nobody is held for one vehicle: others can turn beside it, and it goes as soon as they do."""
+BESIDE_VEH = 1.0
+"""Who turns from a single lane can do so beside one other, who goes as soon as he has; not from two lanes abreast."""
 
 
 class Areas(Protocol):
@@ -39,8 +39,8 @@ class Turning:
 
     letter: int
     turns: tuple[int, ...]
-    groups: tuple[int, ...]
-    """Lane groups from which it comes in."""
+    groups: tuple[tuple[int, float], ...]
+    """Lane groups from which it comes in, and how many others amid the junction its vehicles can turn beside."""
     oncoming: tuple[int, ...]
     """Letters of traffic that it gives way to."""
 
@@ -51,8 +51,8 @@ class Way:
 
     left: tuple[int, ...]
     """Turns for whom no gap in oncoming traffic may have come, and whom the next stage does not let out."""
-    coming: tuple[int, ...]
-    """Lane groups of turns that give way in it."""
+    coming: tuple[tuple[int, float], ...]
+    """Lane groups of turns of this kind that have green in it, as in `Turning`."""
     stopped: tuple[tuple[int, tuple[int, ...]], ...]
     """Turns that people who walk may stop, or one before them that found no gap, each with the lane groups that come
     into its way."""
@@ -92,7 +92,7 @@ class Inside:
             if not any(becomes[letter] in GREEN for letter in (each.letter, *each.oncoming))
             for turn in each.turns
         ]
-        coming = [group for each in turnings if becomes[each.letter] == GIVES_WAY for group in each.groups]
+        coming = [(group, veh) for each in turnings if becomes[each.letter] in GREEN for group, veh in each.groups]
         stopped = tuple(
             (turn, _into_its_way(network, junction, letter, becomes))
             for letter, turns in enumerate(junction.signal_turns)
@@ -109,8 +109,8 @@ class Inside:
         (way, until_s), areas = self._ways[index], self._areas
         if now_s >= until_s:
             return False
-        found_no_gap = sum(areas.amid_veh(turn) for turn in way.left) > ALONE_VEH
-        if found_no_gap and any(areas.close_veh(group) > 0 for group in way.coming):
+        found_no_gap_veh = sum(areas.amid_veh(turn) for turn in way.left)
+        if any(found_no_gap_veh > veh and areas.close_veh(group) > 0 for group, veh in way.coming):
             return True
         is_there = areas.amid_veh if self._network.junctions[index].is_walked else areas.stuck_veh
         return any(
@@ -131,6 +131,16 @@ def _into_its_way(network: Network, junction: Junction, letter: int, state: str)
     return tuple(sorted({network.turns[turn].group for turn in turns}))
 
 
+def _lanes(network: Network, junction: Junction, letter: int) -> dict[int, int]:
+    """Lanes of each lane group from which somebody goes by a letter of a junction."""
+    turns, lanes = set(junction.signal_turns[letter]), dict[int, int]()
+    for lane_set in network.lane_sets:
+        for turn, letters in zip(lane_set.turns, lane_set.letters, strict=True):
+            if turn in turns and letter in letters:
+                lanes[lane_set.group] = lanes.get(lane_set.group, 0) + len(lane_set.lanes)
+    return lanes
+
+
 def _turnings(network: Network, junction: Junction) -> list[Turning]:
     """Those of a junction, by letter."""
     traffic = [len(turns) > 0 for turns in junction.signal_turns]
@@ -141,6 +151,7 @@ def _turnings(network: Network, junction: Junction) -> list[Turning]:
         having = {other for state in giving for other, has in enumerate(state) if has == HAS_WAY}
         oncoming = tuple(sorted(other for other in having if traffic[other] and junction.conflicts[letter][other]))
         if oncoming:
-            groups = tuple(sorted({network.turns[turn].group for turn in turns}))
+            lanes = _lanes(network, junction, letter)
+            groups = tuple((group, BESIDE_VEH if lanes[group] == 1 else 0.0) for group in sorted(lanes))
             found.append(Turning(letter, turns, groups, oncoming))
     return found
