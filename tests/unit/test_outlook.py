@@ -18,7 +18,6 @@ from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import AREA_REACH_M, EXIT, ZONES_M, Floats, Network
 
 BIN_S, BINS = 2.0, 25
-AHEAD = np.full(8, BINS)
 A_BIN = 1.0
 """When in a bin somebody came is not known."""
 
@@ -37,7 +36,7 @@ class Road:
         self.free_s = float(network.free_time_s[link])
         self.speed_m_s = network.links[link].free_speed_m_s
         self.streams = Streams(network)
-        self.outlook = Outlook(network, self.streams, np.full(len(network.junctions), BINS), BIN_S)
+        self.outlook = Outlook(network, self.streams, BINS, BIN_S)
         self.now_s = 0.0
         turns = network.turn_link == link
         share = np.bincount(network.turn_group, network.fraction * turns, len(network.groups))
@@ -134,7 +133,7 @@ def test_a_vehicle_arrives_when_free_speed_brings_it_there(street: Network, ente
 
 def test_who_is_by_the_line_stands_by_lane_group_as_seen(utn17: Network) -> None:
     streams = Streams(utn17)
-    outlook = Outlook(utn17, streams, AHEAD, BIN_S)
+    outlook = Outlook(utn17, streams, BINS, BIN_S)
     near_veh = np.arange(len(utn17.groups), dtype=float)
     seen_veh = np.bincount(utn17.group_link, near_veh, len(utn17.links))
     still = replace(scene(utn17), set_zone_veh=by_the_line(near_veh), x_veh=seen_veh, entered_veh=seen_veh)
@@ -147,7 +146,7 @@ def test_who_is_by_the_line_stands_by_lane_group_as_seen(utn17: Network) -> None
 
 def test_a_queue_that_reaches_back_out_of_sight_follows_whom_the_detectors_see(utn17: Network) -> None:
     link, streams = 0, Streams(utn17)
-    outlook = Outlook(utn17, streams, AHEAD, BIN_S)
+    outlook = Outlook(utn17, streams, BINS, BIN_S)
     road = utn17.links[link]
     storage_veh, ends_m = utn17.storage_veh[link], np.array([0.0, *ZONES_M])
     one = np.zeros(len(utn17.links))
@@ -175,29 +174,6 @@ def test_as_many_more_come_as_have_been_coming(street: Network, gap_s: float) ->
     assert np.mean(seen[350:400]) == pytest.approx(BIN_S / gap_s, rel=0.05)
 
 
-def test_beyond_the_schedule_of_a_neighbour_as_many_come_as_of_late(utn17: Network) -> None:
-    """Where one junction's schedule ends sooner than that of the next."""
-    streams = Streams(utn17)
-    stream = int(np.flatnonzero(streams.next_link != EXIT)[0])
-    link, sender = streams.next_link[stream], utn17.link_junction[streams.link[stream]]
-    soon = AHEAD.copy()
-    soon[sender] = 10
-    expected = []
-    for ahead in (AHEAD, soon):
-        outlook = Outlook(utn17, streams, ahead, BIN_S)
-        entered, one = np.zeros(len(utn17.links)), np.arange(len(utn17.links)) == link
-        for _ in range(200):
-            entered = entered + 1.0 * one
-            # All who come are those that the neighbour has said.
-            outlook.sent_veh[stream, 0] = 1.0
-            _, come = looked(outlook, replace(scene(utn17), entered_veh=entered, x_veh=one.astype(float)))
-        expected.append(come[streams.link == link].sum(axis=0))
-    known = int(utn17.free_time_s[link] / BIN_S + 0.5) - 1 + 10
-    assert expected[1][:known] == pytest.approx(expected[0][:known])
-    assert expected[0][known:] == pytest.approx(0.0, abs=1e-6)
-    assert expected[1][known:] == pytest.approx(1.0, rel=0.05)
-
-
 def test_nobody_is_expected_any_more_once_they_have_stopped_coming(utn17: Network) -> None:
     road = Road(utn17, 0, np.arange(0.5, 600, 4))
     for _ in range(300):
@@ -211,7 +187,7 @@ def test_nobody_is_expected_any_more_once_they_have_stopped_coming(utn17: Networ
 def test_whom_a_neighbour_sends_arrives_after_the_way_along_the_link(utn17: Network) -> None:
     streams = Streams(utn17)
     for stream in np.flatnonzero(streams.next_link != EXIT):
-        outlook = Outlook(utn17, streams, AHEAD, BIN_S)
+        outlook = Outlook(utn17, streams, BINS, BIN_S)
         link, place = streams.next_link[stream], 4
         outlook.sent_veh[stream, place] = 3.0
         stand, come = looked(outlook, scene(utn17))
@@ -252,7 +228,7 @@ def test_it_goes_by_the_turning_fractions_that_it_is_told(utn17: Network) -> Non
 @pytest.mark.parametrize("length_m", [2.0, 8.0, 13.0])
 def test_whom_a_neighbour_sends_onto_a_road_of_a_moment_comes_and_nobody_else(utn17: Network, length_m: float) -> None:
     short = tuple(replace(link, length_m=length_m) for link in utn17.links)
-    outlook = Outlook(replace(utn17, links=short), streams := Streams(utn17), AHEAD, BIN_S)
+    outlook = Outlook(replace(utn17, links=short), streams := Streams(utn17), BINS, BIN_S)
     stream = int(np.flatnonzero(streams.next_link != EXIT)[0])
     # Those behind it in memory are sent off by others, to other roads.
     outlook.sent_veh[:] = np.where(streams.next_link != streams.next_link[stream], 1000.0, 0.0)[:, None]

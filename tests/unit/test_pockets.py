@@ -109,7 +109,7 @@ def test_nobody_is_expected_in_other_lanes_while_a_full_pocket_stands_in_the_way
     upstream[link, 2] = before_veh[link]
     x = np.bincount(pockets.group_link, zone.sum(axis=1), len(before_veh)) + upstream.sum(axis=1)
     view = replace(scene(pockets), set_zone_veh=zone, link_zone_veh=upstream, x_veh=x)
-    outlook = Outlook(pockets, streams, np.full(len(pockets.junctions), 25), 2.0)
+    outlook = Outlook(pockets, streams, 25, 2.0)
     _, come, weight = outlook.look(view, view.zone_veh(view.free), np.zeros(len(view.x_veh)))
     others = (streams.link == link) & (streams.group != pocket)
     assert others.any()

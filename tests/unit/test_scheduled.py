@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
-from utn_controllers.scheduled.ending import Ending, ahead, lost, needing, staying
+from utn_controllers.scheduled.ending import Ending, ahead_bins, lost, needing, staying
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.moves import Moves, Rules, going
@@ -528,12 +528,17 @@ class TestEnding:
         assert found[0] < found[1] < found[2]
         assert found[2] - found[1] == pytest.approx((12 - 8) * (found[1] - found[0]) / (8 - 4), rel=0.5)
 
-    def test_schedules_go_farther_where_clearances_take_long(self) -> None:
-        assert ahead(25, np.array([0, 4, 9])).tolist() == [25, 25, 25]
-        some, more, most, endless = ahead(25, np.array([10, 16, 30, 300]))
-        assert 25 < some < more < most == endless
+    def test_schedules_go_farther_where_the_clearances_of_a_junction_alone_take_long(
+        self, utn17: Network, street_of: Callable[[Make], Network]
+    ) -> None:
+        alone = street_of(odd_nets.actuated_left_turns)
+        near, some, more, most, endless = (
+            ahead_bins(alone, Streams(alone), 25, np.array([lost_bins]))[0] for lost_bins in (9, 10, 16, 30, 300)
+        )
+        assert near == 25 < some < more < most == endless
         # Who wants it farther than any has it so.
-        assert ahead(100, np.array([4, 30])).tolist() == [100, 100]
+        assert ahead_bins(alone, Streams(alone), 100, np.array([30])) == [100]
+        assert (ahead_bins(utn17, Streams(utn17), 25, np.full(8, 30)) == 25).all()
 
     def test_whoever_needs_a_stage_for_himself_has_others_wait_for_him(self) -> None:
         # A main road of two streams beside a left turn, and a side road.

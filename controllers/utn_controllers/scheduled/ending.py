@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.contract import Bools, Floats, Ints
+from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 LEAST_STAYING_BINS = 5.0
 """Who is still there when a schedule ends waits so much longer, or more."""
@@ -23,7 +23,8 @@ NEEDING_OF_STAYING = 1.4
 """So many times as long as he waits longer than that have others to wait who come while he is let go."""
 
 FAR_BINS, FARTHER, FARTHEST_BINS = 9, 3.0, 60
-"""For each bin more than so many that the clearances of a cycle take, a schedule goes so many farther, up to so many.
+"""For each bin more than so many that clearances take of a cycle, one of a junction alone goes so many farther, up to so
+many.
 One that ends before each stage has had its turn changes them more often than there is time for, and has those wait of
 whom fewest leave in a bin."""
 
@@ -63,9 +64,15 @@ def lost(first_stage: Ints, clearance: Ints) -> Ints:
     return np.array(found, dtype=np.int64)
 
 
-def ahead(bins: int, lost_bins: Ints) -> Ints:
-    """(J,) bins that schedules have: so many where the clearances of a cycle take little."""
+def ahead_bins(network: Network, streams: Streams, bins: int, lost_bins: Ints) -> Ints:
+    """(J,) bins that schedules have: so many, or more where the clearances of a cycle take `lost_bins` (J,).
+
+    Not of junctions between which somebody goes: farther off all depends on what the neighbours do.
+    """
+    between = streams.next_link != EXIT
     more = FARTHER * np.maximum(lost_bins - FAR_BINS, 0)
+    more[network.link_junction[streams.link[between]]] = 0
+    more[network.link_junction[streams.next_link[between]]] = 0
     return np.rint(np.minimum(bins + more, max(FARTHEST_BINS, bins))).astype(np.int64)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.scheduled.calling import Calling
-from utn_controllers.scheduled.ending import Ending, ahead, lost
+from utn_controllers.scheduled.ending import Ending, ahead_bins, lost
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
@@ -66,7 +66,8 @@ class Scheduled:
         self._calling = Calling(network, self._streams)
         moves = Moves(network, self._calling, BIN_S)
         lost_bins = lost(self._streams.first_stage, moves.bins)
-        bins = ahead(round(self.settings.horizon_s / BIN_S), lost_bins)
+        ahead = ahead_bins(network, self._streams, round(self.settings.horizon_s / BIN_S), lost_bins)
+        bins = int(ahead.max())
         self._outlook = Outlook(network, self._streams, bins, BIN_S)
         self._worth = Worth(
             network,
@@ -91,13 +92,13 @@ class Scheduled:
             moves.row,
             moves.bins,
             np.maximum(network.least_green_s[stages] // BIN_S, 1).astype(np.int64),
-            bins,
+            ahead,
             self._giving.gaps,
         )
         self._ending = Ending(self._streams, lost_bins)
-        self._plan = np.full((len(network.junctions), bins.max()), -1)
+        self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules, of each junction as far as they go."""
-        self._sent_veh = np.zeros((len(self._calling.letters), bins.max()))
+        self._sent_veh = np.zeros((len(self._calling.letters), bins))
         """(A, K) what each stream sends off by them."""
         self._row = np.argsort(stages)
         """(S,) row of the rules in which each of the network's stages is."""
@@ -105,7 +106,7 @@ class Scheduled:
         """Junctions whose green is to end at the next decision, and the stage then: who could be led there sooner."""
         self._stopped: dict[tuple[int, int], tuple[int, ...]] = {}
         """Lane sets that have green in one stage and none in another, of those that it was asked for."""
-        self._endless = bins
+        self._endless = np.full(len(network.junctions), bins)
         self._green_s: Floats | None = None
         self._take_up()
         self._warm_up()

@@ -8,8 +8,8 @@ import numpy as np
 
 from utn_controllers.scheduled.pockets import held_up, rooms_veh
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.compiling import compiled, inlined
-from utn_sumo.contract import EXIT, ZONES_M, Bools, Floats, Ints, Network
+from utn_sumo.compiling import compiled
+from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
 
 MEMORY_S = 120.0
 """Over what time the rate is taken with which vehicles come from where no schedule is known."""
@@ -34,9 +34,7 @@ class Outlook:
     send, and as many more as have been coming of late from elsewhere.
     """
 
-    def __init__(self, network: Network, streams: Streams, ahead: Ints, bin_s: float):
-        """`ahead` (J,) bins of each junction's schedules, K of the longest."""
-        bins = int(ahead.max())
+    def __init__(self, network: Network, streams: Streams, bins: int, bin_s: float):
         self.network = network
         self.streams = streams
         self.bin_s = bin_s
@@ -52,8 +50,6 @@ class Outlook:
         """(Z,) from where the lane-area detectors begin to arrival."""
         self._came = np.zeros((int(np.ceil(self._due_s.max(initial=0.0) / bin_s)) + 1, len(network.links)))
         """Vehicles that came onto each link in each of the last bins, in a ring."""
-        self._known = self._known_bins(ahead)
-        """(Z,) bins of which the schedules that feed a link say who comes."""
         self._now = 0
         self._before_veh = np.zeros(len(network.links))
         self._rate = np.zeros((2, len(network.links)))
@@ -63,14 +59,6 @@ class Outlook:
         set_veh, before_veh = rooms_veh(network)
         self._room = np.bincount(network.set_group, set_veh, len(network.groups)), before_veh
         self.take_up(network.fraction)
-
-    def _known_bins(self, ahead: Ints) -> Ints:
-        known = np.full(len(self._due_s), ahead.max())
-        for link, then in zip(self.streams.link, self.streams.next_link, strict=True):
-            if then != EXIT:
-                sent = _delay(self._due_s[then], self.bin_s) + ahead[self.network.link_junction[link]]
-                known[then] = min(known[then], sent)
-        return known
 
     @property
     def come_veh(self) -> Floats:
@@ -114,7 +102,6 @@ class Outlook:
             self.shares.of_link,
             self.shares.of_set,
             self._group_share,
-            self._known,
             self.bin_s,
         )
         return stand, come, held
@@ -156,7 +143,6 @@ def _look(
     of_link: Floats,
     of_set: Floats,
     share: Floats,
-    known: Ints,
     bin_s: float,
 ) -> tuple[Floats, Floats, Floats]:
     links, bins = len(x), sent.shape[1]
@@ -168,7 +154,7 @@ def _look(
         before[link] = entered[link]
         if asked[link] and due_s[link] > sight_s[link]:
             _arrive(came[:, link], now, max(far[link], 0.0), sight_s[link], due_s[link], coming[link], bin_s)
-    _send(asked, sent, next_link, came[now], rate, due_s, known, coming, bin_s)
+    _send(asked, sent, next_link, came[now], rate, due_s, coming, bin_s)
     shut, held = held_up(seen, upstream, x, share, room, upstream_room, group_link)
     stand, come = np.zeros(len(stream_link)), np.zeros((len(stream_link), bins))
     for stream in range(len(stream_link)):
@@ -216,12 +202,6 @@ def _arrive(came: Floats, now: int, veh: float, sight_s: float, due_s: float, co
     coming[min(int(sight_s / bin_s), len(coming) - 1)] += veh
 
 
-@inlined
-def _delay(due_s: float, bin_s: float) -> int:
-    """Bins from one in which somebody is sent to that in which he arrives, `due_s` after he came onto the link."""
-    return int(due_s / bin_s + 0.5) - 1
-
-
 @compiled
 def _send(
     asked: Bools,
@@ -230,14 +210,10 @@ def _send(
     came: Floats,
     rate: Floats,
     due_s: Floats,
-    known: Ints,
     coming: Floats,
     bin_s: float,
 ) -> None:
-    """Adds whom the neighbours will send, if they do as they have planned, and as many more as came of late.
-
-    Of bins beyond the `known` (Z,) no schedule says who comes: all that came of late are to come then too.
-    """
+    """Adds whom the neighbours will send, if they do as they have planned, and as many more as came of late."""
     links, bins = coming.shape
     fresh = bin_s / MEMORY_S
     for link in range(links):
@@ -250,8 +226,8 @@ def _send(
             if not asked[link]:
                 continue
             # A bin of what it has planned has gone by; who left in it is mostly amid the junction, not yet counted.
-            delay = _delay(due_s[link], bin_s)
-            for place in range(max(delay, 0), min(bins, known[link])):
+            delay = int(due_s[link] / bin_s + 0.5) - 1
+            for place in range(max(delay, 0), min(bins, bins + delay)):
                 coming[link, place] += sent[stream, place - delay]
     for link in range(links):
         if not asked[link]:
@@ -259,4 +235,4 @@ def _send(
         others = max(rate[0, link] - rate[1, link], 0.0)
         for place in range(bins):
             if (place + 0.5) * bin_s > due_s[link]:
-                coming[link, place] += others if place < known[link] else rate[0, link]
+                coming[link, place] += others
