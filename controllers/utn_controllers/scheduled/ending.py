@@ -23,8 +23,8 @@ NEEDING_OF_STAYING = 1.4
 """So many times as long as he waits longer than that have others to wait who come while he is let go."""
 
 FAR_BINS, FARTHER, FARTHEST_BINS = 9, 3.0, 60
-"""For each bin more than so many that clearances take of a cycle, a schedule of a junction alone goes so many farther, up
-to so many. One that ends before each stage has had its turn changes them more often than there is time for, and has
+"""For each bin more than so many that clearances take of a cycle, a schedule of a junction alone goes so many farther,
+up to so many. One that ends before each stage has had its turn changes them more often than there is time for, and has
 those wait of whom fewest leave in a bin."""
 
 
