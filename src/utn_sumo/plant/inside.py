@@ -131,14 +131,10 @@ def _into_its_way(network: Network, junction: Junction, letter: int, state: str)
     return tuple(sorted({network.turns[turn].group for turn in turns}))
 
 
-def _lanes(network: Network, junction: Junction, letter: int) -> dict[int, int]:
-    """Lanes of each lane group from which somebody goes by a letter of a junction."""
-    turns, lanes = set(junction.signal_turns[letter]), dict[int, int]()
-    for lane_set in network.lane_sets:
-        for turn, letters in zip(lane_set.turns, lane_set.letters, strict=True):
-            if turn in turns and letter in letters:
-                lanes[lane_set.group] = lanes.get(lane_set.group, 0) + len(lane_set.lanes)
-    return lanes
+def _lanes(network: Network, group: int, letter: int) -> int:
+    """Lanes of a lane group from which somebody goes by a letter of its junction."""
+    own = network.lane_sets[slice(*np.searchsorted(network.set_group, (group, group + 1)))]
+    return sum(len(each.lanes) for each in own if any(letter in letters for letters in each.letters))
 
 
 def _turnings(network: Network, junction: Junction) -> list[Turning]:
@@ -151,7 +147,7 @@ def _turnings(network: Network, junction: Junction) -> list[Turning]:
         having = {other for state in giving for other, has in enumerate(state) if has == HAS_WAY}
         oncoming = tuple(sorted(other for other in having if traffic[other] and junction.conflicts[letter][other]))
         if oncoming:
-            lanes = _lanes(network, junction, letter)
-            groups = tuple((group, BESIDE_VEH if lanes[group] == 1 else 0.0) for group in sorted(lanes))
+            own = sorted({network.turns[turn].group for turn in turns})
+            groups = tuple((group, 0.0 if _lanes(network, group, letter) > 1 else BESIDE_VEH) for group in own)
             found.append(Turning(letter, turns, groups, oncoming))
     return found
