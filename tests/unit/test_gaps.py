@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import linprog
 
 from tests.integration import odd_nets
 from tests.unit.views import by_the_line, scene
@@ -19,7 +20,7 @@ from utn_controllers.scheduled.gaps import GAP_S, HEADWAY_S, Gaps, Giving, clear
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.contract import Network
-from utn_sumo.network.lanes import lane_sets
+from utn_sumo.network.lanes import lane_sets, unevenness
 
 Make = Callable[[Path], Any]
 StreetOf = Callable[[Make], Network]
@@ -166,26 +167,72 @@ def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
     assert seen[16:18] == [1.0, 1.0]
 
 
+def sets_of(ways: dict[int, dict[int, set[int]]], states: list[str], **share: float) -> list[tuple[int, ...]]:
+    """The lanes of each set, where all turns not named (`to8=0.6`) share the rest of the traffic alike."""
+    turns = {turn for own in ways.values() for turn in own}
+    named = {int(name[2:]): value for name, value in share.items()}
+    rest = (1 - sum(named.values())) / max(len(turns - named.keys()), 1)
+    return [lanes for lanes, _ in lane_sets(ways, states, {turn: named.get(turn, rest) for turn in turns})]
+
+
 def test_lanes_part_where_somebody_gives_way_and_else_not() -> None:
     ways = {0: {7: {0}, 8: {1}}, 1: {8: {2}}, 2: {8: {3}, 9: {4}}}
-    assert lane_sets(ways, ["GGGGG", "rrrrr"]) == [((0, 1, 2), {7: {0}, 8: {1, 2, 3}, 9: {4}})]
-    assert [lanes for lanes, _ in lane_sets(ways, ["GGGGg", "rrrrr"])] == [(0,), (1,), (2,)]
+    whole = {7: {0}, 8: {1, 2, 3}, 9: {4}}
+    assert lane_sets(ways, ["GGGGG", "rrrrr"], dict.fromkeys(whole, 1 / 3)) == [((0, 1, 2), whole)]
+    assert sets_of(ways, ["GGGGg", "rrrrr"]) == [(0,), (1,), (2,)]
     alike = {0: {8: {0}}, 1: {8: {1}}, 2: {8: {2}, 9: {3}}}
-    assert [lanes for lanes, _ in lane_sets(alike, ["GGGg", "rrrr"])] == [(0, 1), (2,)]
+    assert sets_of(alike, ["GGGg", "rrrr"]) == [(0, 1), (2,)]
 
 
 def test_lanes_part_where_one_stands_behind_who_has_red_while_another_goes() -> None:
     ways = {0: {7: {0}, 8: {1}}, 1: {8: {2}, 9: {3}}}
-    assert [lanes for lanes, _ in lane_sets(ways, ["GGGr", "rrrG"])] == [(0,), (1,)]
+    assert sets_of(ways, ["GGGr", "rrrG"]) == [(0,), (1,)]
     for alike in (["GGGG", "rrrr"], ["GGGG", "Grrr"], ["GGGG", "GrrG"]):
-        assert [lanes for lanes, _ in lane_sets(ways, alike)] == [(0, 1)]
+        assert sets_of(ways, alike) == [(0, 1)]
     # Or one has red while another goes.
-    assert [lanes for lanes, _ in lane_sets(ways, ["GGGG", "rrGG"])] == [(0,), (1,)]
+    assert sets_of(ways, ["GGGG", "rrGG"]) == [(0,), (1,)]
+
+
+def test_lanes_part_where_one_has_much_more_to_let_go_than_others() -> None:
+    ways = {0: {7: {0}, 8: {1}}, 1: {8: {2}}, 2: {8: {3}, 9: {4}}}
+    assert sets_of(ways, ["GGGGG", "rrrrr"], to9=0.38) == [(0, 1, 2)]
+    assert sets_of(ways, ["GGGGG", "rrrrr"], to9=0.42) == [(0,), (1,), (2,)]
+    # Lanes alike stay together, and hardly anybody takes those for buses.
+    alike = {0: {8: {0}}, 1: {8: {1}}, 2: {9: {2}}}
+    assert sets_of(alike, ["GGG", "rrr"], to9=0.5) == [(0, 1), (2,)]
+    assert lane_sets(alike, ["GGG", "rrr"], {8: 0.5, 9: 0.5}, {0}) == [((0,), {8: {0}}), ((1, 2), {8: {1}, 9: {2}})]
+
+
+def test_lanes_part_at_a_junction_of_many_stages() -> None:
+    ways = {0: {7: {0}, 8: {1}}, 1: {8: {2}}}
+    assert sets_of(ways, ["GGG", "rrr", "rrr"]) == [(0, 1)]
+    assert sets_of(ways, ["GGG", "rrr", "rrr", "rrr"]) == [(0,), (1,)]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 3), st.integers(1, 4), st.floats(0.01, 1.0)), min_size=1, max_size=5),
+)
+def test_how_uneven_lanes_are_is_what_is_left_when_all_share_as_well_as_they_can(
+    turns: list[tuple[int, int, float]],
+) -> None:
+    share = {turn: veh for turn, (_, _, veh) in enumerate(turns)}
+    ways = {
+        lane: {turn: {turn} for turn, (begin, count, _) in enumerate(turns) if begin <= lane < begin + count}
+        for lane in range(max(begin + count for begin, count, _ in turns))
+    }
+    taken = [(lane, turn) for lane, own in ways.items() for turn in own]
+    # The least of the fullest lane's load, by how much of each turn takes each lane, and that load.
+    load = np.array([[float(lane == each) for each, _ in taken] + [-1.0] for lane in ways])
+    whole = np.array([[float(turn == each) for _, each in taken] + [0.0] for turn in share])
+    least = linprog(
+        [0.0] * len(taken) + [1.0], A_ub=load, b_ub=np.zeros(len(ways)), A_eq=whole, b_eq=list(share.values())
+    ).fun
+    assert unevenness(ways, share) == pytest.approx(least / (sum(share.values()) / len(ways)))
 
 
 def test_lanes_for_buses_are_sets_of_their_own_that_hardly_anybody_takes(street_of: StreetOf) -> None:
     alike = {0: {8: {0}}, 1: {8: {1}}, 2: {8: {2}}}
-    assert [lanes for lanes, _ in lane_sets(alike, ["GGG", "rrr"], {0})] == [(0,), (1, 2)]
+    assert [lanes for lanes, _ in lane_sets(alike, ["GGG", "rrr"], {8: 1.0}, {0})] == [(0,), (1, 2)]
     network = street_of(odd_nets.bus_lanes)
     streams = Streams(network)
     share = streams.shares(network.fraction).set_of_link

@@ -303,6 +303,7 @@ class _Reader:
             states[stage.junction].append(stage.state)
         shown = [states[self.junction_of[self.approaches[group.link]]] for group in groups]
         reserved = [reserved_lanes(self.net.getEdge(self.approaches[group.link])) for group in groups]
+        share = {index: turn.fraction for index, turn in enumerate(turns)}
         return [
             LaneSet(
                 group,
@@ -312,7 +313,7 @@ class _Reader:
                 is_reserved=lanes[0] in reserved[group],
             )
             for group, (by_lane, of_junction) in enumerate(zip(ways, shown, strict=True))
-            for lanes, own in lane_sets(by_lane, of_junction, reserved[group])
+            for lanes, own in lane_sets(by_lane, of_junction, share, reserved[group])
         ]
 
     def _shares(self, edge_id: str, connections: Mapping[str, list[Any]]) -> list[float]:
