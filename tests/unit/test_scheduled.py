@@ -12,11 +12,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from scipy.optimize import linprog
 
 from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
-from utn_controllers.scheduled.ending import Ending, ahead_bins, lost, needing, staying
+from utn_controllers.scheduled.ending import Ending, ahead_bins, are_alone, greens, lost, needing, prices, staying
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.moves import Moves, Rules, going
@@ -531,14 +532,17 @@ class TestEnding:
     def test_schedules_go_farther_where_the_clearances_of_a_junction_alone_take_long(
         self, utn17: Network, street_of: Callable[[Make], Network]
     ) -> None:
-        alone = street_of(odd_nets.actuated_left_turns)
+        network = street_of(odd_nets.actuated_left_turns)
+        alone = are_alone(network, Streams(network))
+        assert alone.all()
         near, some, more, most, endless = (
-            ahead_bins(alone, Streams(alone), 25, np.array([lost_bins]))[0] for lost_bins in (9, 10, 16, 30, 300)
+            ahead_bins(alone, 25, np.array([lost_bins]))[0] for lost_bins in (9, 10, 16, 30, 300)
         )
         assert near == 25 < some < more < most == endless
         # Who wants it farther than any has it so.
-        assert ahead_bins(alone, Streams(alone), 100, np.array([30])) == [100]
-        assert (ahead_bins(utn17, Streams(utn17), 25, np.full(8, 30)) == 25).all()
+        assert ahead_bins(alone, 100, np.array([30])) == [100]
+        assert not are_alone(utn17, Streams(utn17)).any()
+        assert (ahead_bins(are_alone(utn17, Streams(utn17)), 25, np.full(8, 30)) == 25).all()
 
     def test_whoever_needs_a_stage_for_himself_has_others_wait_for_him(self) -> None:
         # A main road of two streams beside a left turn, and a side road.
@@ -568,13 +572,90 @@ class TestEnding:
         come = np.linspace(0.1, 0.4, len(streams.link))
         needed = []
         for times in (0, 1, 2):
-            ending = Ending(streams, lost(streams.first_stage, times * clearance))
-            assert not ending.weights(np.zeros(len(come))).any()
-            ending.take_up(come, np.ones(len(come)))
-            needed.append(ending.weights(np.zeros(len(come))))
+            none, nobody = np.zeros(len(come)), np.zeros((len(come), 25))
+            lost_bins = lost(streams.first_stage, times * clearance)
+            ending = Ending(streams, lost_bins, np.full(8, 25), np.ones(8, dtype=bool))
+            everywhere = np.ones(8, dtype=bool)
+            assert not ending.weights(everywhere, none, none, nobody).any()
+            ending.take_up(come, np.ones(len(come)), np.ones(len(come)))
+            needed.append(ending.weights(everywhere, none, none, nobody))
         assert not needed[0].any()
         assert needed[1].any()
         assert (needed[2][needed[1] > 0] > needed[1][needed[1] > 0]).all()
+
+    def price(
+        self, serves: Any, rate: Sequence[float], most: Sequence[float], stand: Sequence[float], *,
+        come_veh: float = 0.0, lane_set: Sequence[int] = (),
+    ) -> Floats:  # fmt: skip
+        """Of a junction whose schedules have ten bins, of which four are clearances."""
+        come = np.zeros((len(rate), 12))
+        come[:, 9], come[:, 10] = come_veh, 100.0
+        stages, streams = np.shape(serves)
+        return np.asarray(
+            prices(
+                np.ones(1, dtype=bool), np.array([10]), np.array([4]), np.array([0, streams]), np.array([0, stages]),
+                np.array(serves, dtype=bool), np.array(lane_set or range(streams)), np.array(rate), np.array(most),
+                np.array(stand), come,
+            )
+        )  # fmt: skip
+
+    def test_where_more_are_there_than_can_go_all_who_come_wait_for_who_is_left(self) -> None:
+        # Three lanes and one: five bins of green and ten, nine more than there are; a tenth of the time is spare.
+        found = self.price(np.eye(2), [1.5, 0.4], [3.0, 1.0], [15.0, 10.0])
+        assert found == pytest.approx([1.9 * 90 / 3, 1.9 * 90])
+        # Half of it is.
+        found = self.price(np.eye(2), [0.6, 0.3], [3.0, 1.0], [15.0, 10.0])
+        assert found == pytest.approx([0.9 * 18 / 3, 0.9 * 18])
+        # Not for ever.
+        found = self.price(np.eye(2), [0.6, 0.3], [3.0, 1.0], [3000.0, 10.0])
+        assert found == pytest.approx([0.9 * 150 / 3, 0.9 * 150])
+
+    def test_nobody_waits_longer_where_all_can_go(self) -> None:
+        assert not self.price(np.eye(2), [1.5, 0.4], [3.0, 1.0], [9.0, 3.0]).any()
+        assert self.price(np.eye(2), [1.5, 0.4], [3.0, 1.0], [9.0, 3.0], come_veh=0.1).all()
+
+    def test_who_go_together_take_the_time_together(self) -> None:
+        found = self.price([[1, 1, 0], [0, 0, 1]], [0.3, 0.1, 0.2], [1.0, 1.0, 1.0], [9.0, 9.0, 9.0])
+        assert found[0] + found[1] == pytest.approx(found[2])
+        assert found[0] == pytest.approx(3 * found[1])
+        # Who is in no stage takes none; of two stages the one counts in which others need more.
+        found = self.price([[1, 1, 0, 0], [0, 1, 1, 0]], [0.3, 0.1, 0.1, 0.2], [1.0] * 4, [9.0] * 4)
+        assert found == pytest.approx(found[0] * np.array([1, 1 / 3, 2 / 3, 0]))
+
+    def test_who_share_lanes_take_their_time_one_after_the_other(self) -> None:
+        alone = self.price(np.eye(2), [0.3, 0.3], [1.0, 1.0], [9.0, 9.0])
+        shared = self.price([[1, 1, 0], [0, 0, 1]], [0.2, 0.1, 0.3], [1.0] * 3, [5.0, 4.0, 9.0], lane_set=[7, 7, 2])
+        assert shared == pytest.approx(alone[[0, 0, 1]])
+        # Nor does it take more of one of them where only he goes.
+        parted = self.price(
+            [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0.2, 0.1, 0.3], [1.0] * 3, [5.0, 4.0, 9.0], lane_set=[7, 7, 2]
+        )
+        assert (parted[:2] <= parted[2] + 1e-9).all()
+
+    def test_nobody_is_asked_who_is_not_alone(self, utn17: Network, street_of: Callable[[Make], Network]) -> None:
+        for network in (utn17, street_of(odd_nets.actuated_left_turns)):
+            streams = Streams(network)
+            junctions, count = len(network.junctions), len(streams.link)
+            alone = are_alone(network, streams)
+            ending = Ending(streams, np.full(junctions, 4), np.full(junctions, 25), alone)
+            ending.take_up(np.full(count, 0.2), np.ones(count), np.ones(count))
+            few, many, all_ = np.zeros(count), np.full(count, 90.0), np.ones(junctions, dtype=bool)
+            quiet = ending.weights(all_, few, few, np.zeros((count, 25)))
+            busy = ending.weights(all_, few, many, np.zeros((count, 25)))
+            assert (busy > quiet).any() == alone.any()
+            assert (ending.weights(~all_, few, many, np.zeros((count, 25))) == quiet).all()
+
+    @given(st.data())
+    def test_the_greens_that_all_need_are_enough_and_least_where_no_two_stages_share(self, data: st.DataObject) -> None:
+        stages, streams = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 6))
+        serves = np.array([[data.draw(st.booleans()) for _ in range(streams)] for _ in range(stages)])
+        needed = np.array([data.draw(st.floats(0, 20)) for _ in range(streams)])
+        found = greens(serves, needed)
+        served = serves.any(axis=0)
+        least = linprog(np.ones(stages), -1.0 * serves.T[served], -needed[served]).fun if served.any() else 0.0
+        assert least - 1e-6 <= found <= needed[served].sum() + 1e-6
+        if (serves.sum(axis=0) <= 1).all():
+            assert found == pytest.approx(least, abs=1e-6)
 
 
 class TestMoves:

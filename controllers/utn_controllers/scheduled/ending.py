@@ -6,6 +6,10 @@ Who is left waits until the schedules after this one, the longer the more time a
 wait for him: letting him go takes time of a stage, in which nobody else's vehicles leave. Where one stream has a lane
 and the others many, that is the greater part of it, and a schedule that did not count it would skip the one stage in
 every other cycle, and have its queue wait twice as long for a second or two of all others.
+
+Where more are there and will come than can go in a schedule, all who come until they have gone wait for as long as it
+takes to let one more go. At capacity that is long, and a schedule that did not count it would change its stages as if
+there were time to spare: those of many lanes again and again, while the queue of a single lane grows.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from utn_controllers.scheduled.streams import Streams
+from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 LEAST_STAYING_BINS = 5.0
@@ -21,6 +26,10 @@ QUICK_BINS, STAYING_OF_LOST = 2, 2.5
 """Of what the clearances of a cycle take so little does not count, of the rest so many times: as they, cycles grow."""
 NEEDING_OF_STAYING = 1.4
 """So many times as long as he waits longer than that have others to wait who come while he is let go."""
+MOST_LOAD, LONGEST_BUSY_BINS = 0.9, 150.0
+"""With a greater load a junction would be busy for ever: it is taken for no more, and for so long at most."""
+LEAST_LOAD, NONE_BINS = 1e-6, 1e-9
+"""Who hardly comes needs some green too; green that is none."""
 
 FAR_BINS, FARTHER, FARTHEST_BINS = 9, 3.0, 60
 """For each bin more than so many that clearances take of a cycle, a schedule of a junction alone goes so many farther,
@@ -31,26 +40,112 @@ those wait of whom fewest leave in a bin."""
 class Ending:
     """Keeps what a vehicle of each stream weighs that is left at a schedule's end."""
 
-    def __init__(self, streams: Streams, lost_bins: Ints):
-        """`lost_bins` (J,) are those of `lost`."""
+    def __init__(self, streams: Streams, lost_bins: Ints, ahead_bins: Ints, alone: Bools):
+        """Of `lost`, how far schedules go, and `are_alone` (J,)."""
         self._streams = streams
+        self._lost_bins, self._ahead_bins, self._alone = lost_bins, ahead_bins, alone
         self.staying_bins = staying(lost_bins)
         """(J,) that who is left waits longer."""
         self._staying = np.repeat(self.staying_bins, np.diff(streams.first))
         self._weight = NEEDING_OF_STAYING * (self.staying_bins - LEAST_STAYING_BINS)
         self._needing = np.zeros(len(streams.link))
+        self._come, self._lanes = np.zeros(len(streams.link)), np.ones(len(streams.link))
 
-    def take_up(self, come_veh: Floats, most_veh: Floats) -> None:
-        """Go by these vehicles that come of late, and that a stream alone lets go, in a bin (N,) from now on."""
+    def take_up(self, come_veh: Floats, most_veh: Floats, lanes_veh: Floats) -> None:
+        """Go by these vehicles of each stream (N,) in a bin from now on.
+
+        That come of late, that its lane group lets go at most, and that its own lanes do.
+        """
         streams = self._streams
+        self._come, self._lanes = come_veh, lanes_veh
         for junction, weight in enumerate(self._weight):
             own = slice(*streams.first[junction : junction + 2])
             serves = streams.serves[slice(*streams.first_stage[junction : junction + 2]), own]
             self._needing[own] = weight * needing(serves, come_veh[own], most_veh[own])
 
-    def weights(self, worth: Floats) -> Floats:
-        """(N,) what a vehicle weighs that is left, by what it is worth in a bin."""
-        return np.asarray(worth * self._staying + self._needing)
+    def weights(self, asked: Bools, worth: Floats, stand: Floats, come: Floats) -> Floats:
+        """(N,) what a vehicle weighs that is left before junctions `asked` (J,), by what it is worth in a bin.
+
+        `stand` (N,), `come` (N, K) vehicles as of `schedules`.
+        """
+        streams = self._streams
+        longer = prices(
+            asked & self._alone, self._ahead_bins, self._lost_bins, streams.first, streams.first_stage, streams.serves,
+            streams.lane_set, self._come, self._lanes, stand, come,
+        )  # fmt: skip
+        return np.asarray(worth * self._staying + self._needing + longer)
+
+
+@compiled
+def prices(
+    asked: Bools, ahead_bins: Ints, lost_bins: Ints, first: Ints, first_stage: Ints, serves: Bools, lane_set: Ints,
+    rate: Floats, most: Floats, stand: Floats, come: Floats,
+) -> Floats:  # fmt: skip
+    """(N,) vehicles times bins that others wait longer for each that is left before a junction `asked` (J,).
+
+    A junction is busy beyond its schedule of `ahead_bins` (J,), of which clearances take `lost_bins` (J,) or more,
+    until all have gone who are there then or come meanwhile. Who comes until then waits for the time that one more of
+    a stream takes in its best stage: of those who go together there each lane set has its part of it, by their loads.
+
+    `serves` (S, N), `lane_set` (N,), vehicles that come of late at a `rate` (N,) and leave its lanes at `most` (N,) in
+    a bin, that `stand` (N,) and `come` (N, K).
+    """
+    found = np.zeros(len(rate))
+    for junction in range(len(asked)):
+        if not asked[junction]:
+            continue
+        a, b = first[junction], first[junction + 1]
+        own = serves[first_stage[junction] : first_stage[junction + 1], a:b]
+        work = (stand[a:b] + come[a:b, : ahead_bins[junction]].sum(axis=1)) / most[a:b]
+        beyond = greens(own, _by_lanes(work, lane_set[a:b])) + lost_bins[junction] - ahead_bins[junction]
+        if beyond <= 0:
+            continue
+        load = np.maximum(rate[a:b] / most[a:b], LEAST_LOAD)
+        loads = _by_lanes(load, lane_set[a:b])
+        busy = min(beyond / (1 - min(greens(own, loads), MOST_LOAD)), LONGEST_BUSY_BINS)
+        for stream in range(b - a):
+            part = np.inf
+            for stage in range(len(own)):
+                if own[stage, stream]:
+                    part = min(part, loads[stream] / (own[stage] * load).sum())
+            if part < np.inf:
+                found[a + stream] = rate[a:b].sum() * busy * min(part, 1.0) / most[a + stream]
+    return found
+
+
+@inlined
+def _by_lanes(own: Floats, lane_set: Ints) -> Floats:
+    """(n,) of each stream what all together have that share its lanes."""
+    total = np.zeros(len(own))
+    for stream in range(len(own)):
+        for other in range(len(own)):
+            if lane_set[other] == lane_set[stream]:
+                total[stream] += own[other]
+    return total
+
+
+@compiled
+def greens(serves: Bools, needed: Floats) -> float:
+    """Bins of green in which all streams of a junction have as many as are `needed` (n,), by its stages (s, n).
+
+    Who needs most comes first, in that of his stages that others need most too: seldom more than would have to be.
+    """
+    left, total = needed.copy(), 0.0
+    for stream in range(len(left)):
+        if not serves[:, stream].any():
+            left[stream] = 0.0
+    while len(left) > 0 and left.max() > NONE_BINS:
+        first, best, others = int(left.argmax()), -1, -1.0
+        lasts = left[first]
+        for stage in range(len(serves)):
+            also = (serves[stage] * left).sum()
+            if serves[stage, first] and also > others:
+                best, others = stage, also
+        for stream in range(len(left)):
+            if serves[best, stream]:
+                left[stream] = max(left[stream] - lasts, 0.0)
+        total += lasts
+    return total
 
 
 def lost(first_stage: Ints, clearance: Ints) -> Ints:
@@ -63,15 +158,21 @@ def lost(first_stage: Ints, clearance: Ints) -> Ints:
     return np.array(found, dtype=np.int64)
 
 
-def ahead_bins(network: Network, streams: Streams, bins: int, lost_bins: Ints) -> Ints:
-    """(J,) bins that schedules have: so many, or more where the clearances of a cycle take `lost_bins` (J,).
+def are_alone(network: Network, streams: Streams) -> Bools:
+    """(J,) junctions from which nobody goes on to another one, or comes from there.
 
-    Not of junctions between which somebody goes: farther off all depends on what the neighbours do.
+    Elsewhere all that is farther off depends on what the neighbours do.
     """
     between = streams.next_link != EXIT
-    more = FARTHER * np.maximum(lost_bins - FAR_BINS, 0)
-    more[network.link_junction[streams.link[between]]] = 0
-    more[network.link_junction[streams.next_link[between]]] = 0
+    alone = np.ones(len(network.junctions), dtype=np.bool_)
+    alone[network.link_junction[streams.link[between]]] = False
+    alone[network.link_junction[streams.next_link[between]]] = False
+    return alone
+
+
+def ahead_bins(alone: Bools, bins: int, lost_bins: Ints) -> Ints:
+    """(J,) bins that schedules have: so many, or more of junctions `alone` (J,) whose cycles lose `lost_bins` (J,)."""
+    more = FARTHER * np.maximum(lost_bins - FAR_BINS, 0) * alone
     return np.rint(np.minimum(bins + more, max(FARTHEST_BINS, bins))).astype(np.int64)
 
 

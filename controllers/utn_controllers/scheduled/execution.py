@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.scheduled.calling import Calling
-from utn_controllers.scheduled.ending import Ending, ahead_bins, lost
+from utn_controllers.scheduled.ending import Ending, ahead_bins, are_alone, lost
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
@@ -66,7 +66,8 @@ class Scheduled:
         self._calling = Calling(network, self._streams)
         moves = Moves(network, self._calling, BIN_S)
         lost_bins = lost(self._streams.first_stage, moves.bins)
-        ahead = ahead_bins(network, self._streams, round(self.settings.horizon_s / BIN_S), lost_bins)
+        alone = are_alone(network, self._streams)
+        ahead = ahead_bins(alone, round(self.settings.horizon_s / BIN_S), lost_bins)
         bins = int(ahead.max())
         self._outlook = Outlook(network, self._streams, bins, BIN_S)
         self._worth = Worth(
@@ -95,7 +96,7 @@ class Scheduled:
             ahead,
             self._giving.gaps,
         )
-        self._ending = Ending(self._streams, lost_bins)
+        self._ending = Ending(self._streams, lost_bins, ahead, alone)
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules, of each junction as far as they go."""
         self._sent_veh = np.zeros((len(self._calling.letters), bins))
@@ -115,8 +116,10 @@ class Scheduled:
         """Take up the turning fractions as they are at present, and the plan's greens as bounds if they are to be."""
         self._outlook.take_up(state.fraction)
         self._take_up()
-        flow_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]
-        self._ending.take_up(self._outlook.come_veh, self.settings.discharge * flow_veh_s * BIN_S)
+        of_group_veh_s = self.network.group_saturation_flow_veh_s[self._streams.group]
+        of_lanes_veh_s = self.network.set_saturation_flow_veh_s[self._streams.lane_set]
+        discharge = self.settings.discharge * BIN_S
+        self._ending.take_up(self._outlook.come_veh, discharge * of_group_veh_s, discharge * of_lanes_veh_s)
         if self.settings.bounds == "plan":
             self._green_s = plan.green_s
 
@@ -139,14 +142,13 @@ class Scheduled:
         else:
             rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
             rest = np.clip(rest_s / BIN_S, 0, self._plan.shape[1]).astype(np.int64)
+        ends = self._ending.weights(view.free, worth, stand, come)
         wish, then = schedules(
             view.stage,
             view.free,
             rest,
             self._rules,
-            *self._calling.join(
-                view.calling, self._ending.staying_bins, stand, come, worth, self._ending.weights(worth), most
-            ),
+            *self._calling.join(view.calling, self._ending.staying_bins, stand, come, worth, ends, most),
             self._plan,
             self._sent_veh,
         )

@@ -221,7 +221,7 @@ def let_go(
             found = 1 / (1 + share * headways(gaps.per_veh * towards))
             pace[stream] = free[stream] + (1 - free[stream]) * found if beside else found
             goes = moves[row, stream] * pace[stream]
-            if most[stream] > 0:
+            if beside and most[stream] > 0:
                 # In a bin about one leaves each lane that discharges.
                 free[stream] *= (1 - share) ** (min(veh[stream] / most[stream], goes))
             veh[stream] = max(veh[stream] - goes * most[stream], 0.0)
