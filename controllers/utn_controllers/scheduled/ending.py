@@ -68,12 +68,15 @@ class Ending:
 
         `stand` (N,), `come` (N, K) vehicles as of `schedules`.
         """
+        ends = worth * self._staying + self._needing
+        if not self._alone.any():
+            return np.asarray(ends)
         streams = self._streams
         longer = prices(
             asked & self._alone, self._ahead_bins, self._lost_bins, streams.first, streams.first_stage, streams.serves,
             streams.lane_set, self._come, self._lanes, stand, come,
         )  # fmt: skip
-        return np.asarray(worth * self._staying + self._needing + longer)
+        return np.asarray(ends + longer)
 
 
 @compiled
