@@ -7,9 +7,9 @@ wait for him: letting him go takes time of a stage, in which nobody else's vehic
 and the others many, that is the greater part of it, and a schedule that did not count it would skip the one stage in
 every other cycle, and have its queue wait twice as long for a second or two of all others.
 
-Where more are there and will come than can go in a schedule, all who come until they have gone wait for as long as it
-takes to let one more go. At capacity that is long, and a schedule that did not count it would change its stages as if
-there were time to spare: those of many lanes again and again, while the queue of a single lane grows.
+At a junction alone where more are there and will come than can go in a schedule, all who come until they have gone wait
+for as long as it takes to let one more go. At capacity that is long, and a schedule that did not count it would change
+its stages as if there were time to spare: those of many lanes again and again, while the queue of a single lane grows.
 """
 
 from __future__ import annotations
