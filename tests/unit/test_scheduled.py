@@ -868,6 +868,27 @@ class TestExecution:
             execution.wish(replace(scene(utn17), set_zone_veh=by_the_line(near_veh), x_veh=x_veh))
             assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
 
+    @pytest.mark.parametrize(("share", "moves"), [((1.0, 0.0), False), ((0.0, 1.0), False), ((0.5, 0.5), True)])
+    def test_nobody_is_sent_onto_a_link_of_which_one_lane_is_full(
+        self, share: tuple[float, float], moves: bool, street_of: Callable[[Make], Network]
+    ) -> None:
+        # Left turns give way and have the inner lane, all others the outer one.
+        street = street_of(odd_nets.shared_letters)
+        streams = Streams(street)
+        stream = int(np.flatnonzero(streams.next_link != EXIT)[0])
+        ahead = int(streams.next_link[stream])
+        inner_and_outer = np.flatnonzero(street.set_link == ahead)
+        assert [len(street.lane_sets[lane_set].lanes) for lane_set in inner_and_outer] == [1, 1]
+        # Nearly as many as fit on one lane are not half as many as fit on the link.
+        x_veh = np.zeros(len(street.links))
+        x_veh[ahead] = 0.45 * street.storage_veh[ahead]
+        near_veh = np.zeros(len(street.lane_sets))
+        near_veh[streams.lane_set[stream]] = 8.0
+        near_veh[inner_and_outer] = x_veh[ahead] * np.array(share)
+        execution = Scheduled(street, full=0.8)
+        execution.wish(replace(scene(street), set_zone_veh=by_the_line(near_veh), x_veh=x_veh))
+        assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
+
     @pytest.mark.parametrize(("ahead", "goes"), [(0.3, "3"), (0.6, "2")])
     def test_who_brings_most_onto_a_road_that_fills_up_waits_however_many_of_them_turn_elsewhere(
         self, ahead: float, goes: str, utn17: Network

@@ -11,6 +11,9 @@ from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 FADING = 0.2
 """Over what share of its storage about `full` a link is fed less and less."""
+FULL_LANE = 0.7
+"""Share of its own room about which the fullest lanes of a link do the same, however empty the others: who wants to get
+onto them stands before it, in the way of all behind."""
 LEAST_WORTH = 0.05
 """Of a vehicle that would go from an empty link into a full one."""
 HOLDING_BACK = 0.4, 0.5
@@ -37,6 +40,13 @@ class Worth:
         self._set_junction = network.link_junction[network.set_link]
         set_veh, before_veh = rooms_veh(network)
         self._room = set_veh, before_veh
+        lanes = np.array([len(lane_set.lanes) for lane_set in network.lane_sets], dtype=np.float64)
+        unseen_veh = network.storage_veh - np.bincount(network.set_link, set_veh, len(network.links))
+        of_link = lanes / np.bincount(network.set_link, lanes, len(network.links))[network.set_link]
+        self._lane_room = set_veh + of_link * np.maximum(unseen_veh, 0.0)[network.set_link]
+        """(L,) vehicles that the lanes of each set hold, with their part of the link out of sight of their own."""
+        self._seen = np.zeros(len(network.lane_sets))
+        """(L,) vehicles that were on the lanes of each set in sight when somebody looked last."""
         self._wide = np.array([link.lanes > 1 for link in network.links], dtype=np.bool_)
         """(Z,) links of which one lane may be full and another one empty."""
         self._late = np.zeros(len(network.links))
@@ -72,8 +82,11 @@ class Worth:
             time_s, asked, self._set_junction, network.set_link, *zones, *self._room,
             shares.set_of_link, self._dense, self._looked_s, self._empty_s,
         )  # fmt: skip
+        fullest = _fullest(
+            asked, self._set_junction, network.set_link, zones[0], x, self._lane_room, shares.set_of_link, self._seen
+        )
         worth, moving = _worth(
-            x, network.storage_veh, self._dense, network.begins_amid, streams.link, streams.lane_set, streams.group,
+            x, network.storage_veh, fullest, self._dense, network.begins_amid, streams.link, streams.lane_set, streams.group,
             streams.next_link, shares.of_link, shares.of_set, self._wide, self._late, time_s - self._time_s, most,
             stuck, held, time_s, self._empty_s, *self._settings,
         )  # fmt: skip
@@ -98,6 +111,25 @@ def _lasting(
 
 
 @compiled
+def _fullest(
+    asked: Bools, set_junction: Ints, set_link: Ints, zone: Floats, x: Floats, room: Floats, share: Floats, seen: Floats
+) -> Floats:
+    """(Z,) share that is taken of the lane set of each link that is fullest; `seen` (L,) is brought up to date.
+
+    Whoever of a link's `x` (Z,) is not seen on some set's lanes is shared out as traffic is, by `share` (L,).
+    """
+    fullest, elsewhere = np.zeros(len(x)), x.copy()
+    for lane_set, link in enumerate(set_link):
+        if asked[set_junction[lane_set]]:
+            seen[lane_set] = zone[lane_set].sum()
+        elsewhere[link] -= seen[lane_set]
+    for lane_set, link in enumerate(set_link):
+        veh = seen[lane_set] + share[lane_set] * max(elsewhere[link], 0.0)
+        fullest[link] = max(fullest[link], veh / room[lane_set])
+    return fullest
+
+
+@compiled
 def _lasts(dense: Floats) -> Floats:
     """By how much queues as dense as this hold up who is behind them, 0 to 1."""
     return np.maximum(dense - DENSE, 0.0) / (1 - DENSE)
@@ -105,7 +137,7 @@ def _lasts(dense: Floats) -> Floats:
 
 @compiled
 def _worth(
-    x: Floats, storage: Floats, dense: Floats, amid: Bools, links: Ints, sets: Ints, groups: Ints, next_links: Ints,
+    x: Floats, storage: Floats, fullest: Floats, dense: Floats, amid: Bools, links: Ints, sets: Ints, groups: Ints, next_links: Ints,
     of_link: Floats, of_set: Floats, wide: Bools, late: Floats, ago_s: float, most: Floats, stuck: Bools, held: Floats,
     time_s: float, empty_s: Floats, crowding: float, blocking: float, starving: float, full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
@@ -128,9 +160,10 @@ def _worth(
         # With queues enough for the best stages there are others that would never be worth their clearance.
         starved = min((time_s - empty_s[sets[stream]]) / STARVED_S, 1.0)
         worth[stream] = held[groups[stream]] * (1 + starving * starved) * max(value, LEAST_WORTH)
-        fed = (full + FADING / 2 - there) / FADING
-        if fed < 1:
-            moving[stream] = max(fed * most[stream], BLOCKED_VEH)
+        if ahead != EXIT:
+            fed = (FADING / 2 + min(full - there, FULL_LANE - fullest[ahead])) / FADING
+            if fed < 1:
+                moving[stream] = max(fed * most[stream], BLOCKED_VEH)
         if stuck[stream]:
             moving[stream] = BLOCKED_VEH
     return worth, moving
