@@ -44,7 +44,7 @@ class ScheduledSettings(BaseModel):
     """By how much waiting on a full link costs more than on an empty one, in vehicles."""
     blocking: float = Field(4.0, ge=0, le=20)
     """By how much more it costs in a queue that others have to wait behind, one link back, in vehicles."""
-    starving: float = Field(0.5, ge=0, le=20)
+    starving: float = Field(1.5, ge=0, le=20)
     """By how much more it costs where nobody has been let go to the last one for two minutes, in shares."""
     full: float = Field(0.4, gt=0, le=2)
     """Share of its storage about which a link is fed less and less: beyond it some lane is full and stops all."""

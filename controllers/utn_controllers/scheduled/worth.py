@@ -26,7 +26,8 @@ LASTING_S = 100.0
 DENSE = 0.3
 """Share of the room in sight from which on, over that time, a queue holds up who is behind it."""
 STARVED_S = 120.0
-"""Who has not been let go to the last one for so long weighs more by all of `starving`."""
+"""Who has not been let go to the last one for so long weighs more by all of `starving`, before that by the square of
+his share of it: most queues are gone within half of that time, and those are no matter."""
 
 
 class Worth:
@@ -158,7 +159,7 @@ def _worth(
         blocks = queue[sets[stream]] * behind[link] / feeding[link] if feeding[link] > 0 else 0.0
         value = (1 + crowding * (taken[link] - there) + blocking * blocks) * (1 - back[sets[stream]])
         # With queues enough for the best stages there are others that would never be worth their clearance.
-        starved = min((time_s - empty_s[sets[stream]]) / STARVED_S, 1.0)
+        starved = min((time_s - empty_s[sets[stream]]) / STARVED_S, 1.0) ** 2
         worth[stream] = held[groups[stream]] * (1 + starving * starved) * max(value, LEAST_WORTH)
         if ahead != EXIT:
             fed = (FADING / 2 + min(full - there, FULL_LANE - fullest[ahead])) / FADING
