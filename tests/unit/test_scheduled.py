@@ -23,6 +23,7 @@ from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.moves import Moves, Rules, going
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
+from utn_controllers.scheduled.worth import Worth
 from utn_sumo.contract import EXIT, ZONES_M, Floats, Ints, Network
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.heads import Heads
@@ -986,6 +987,24 @@ class TestExecution:
             else:
                 execution.wish(view)
         assert served == (starving > 0)
+
+    def test_who_is_never_let_go_to_the_last_one_weighs_more_by_the_square_of_how_long(self, utn17: Network) -> None:
+        streams = Streams(utn17)
+        count, sets = len(streams.link), len(utn17.lane_sets)
+        worth = Worth(utn17, streams, crowding=0.0, blocking=0.0, starving=2.0, full=1.0)
+        shares, all_of_them = streams.shares(utn17.fraction), np.ones(len(utn17.junctions), dtype=bool)
+
+        def weigh(time_s: float, near_veh: float) -> Floats:
+            zones = by_the_line(np.full(sets, near_veh)), np.zeros((len(utn17.links), len(ZONES_M)))
+            nobody, none = np.zeros(len(utn17.links)), np.zeros(count, dtype=bool)
+            most, held = np.ones(count), np.ones(len(utn17.groups))
+            return worth.look(time_s, all_of_them, zones, nobody, shares, most, none, held)[0]
+
+        found = [weigh(time_s, 3.0) for time_s in (0.0, 30.0, 60.0, 120.0, 300.0)]
+        assert np.array(found) == pytest.approx(np.array([[1.0], [1.125], [1.5], [3.0], [3.0]]) + np.zeros(count))
+        # One moment with nobody there, and all begins anew.
+        weigh(302.0, 0.0)
+        assert weigh(332.0, 3.0) == pytest.approx(np.full(count, 1.125))
 
     @pytest.mark.parametrize(
         ("goes", "stands", "stays"), [(False, True, False), (True, True, True), (False, False, True)]
