@@ -890,6 +890,22 @@ class TestExecution:
         execution.wish(replace(scene(street), set_zone_veh=by_the_line(near_veh), x_veh=x_veh))
         assert (execution._outlook.sent_veh[stream].sum() > 0.1) == moves
 
+    @pytest.mark.parametrize(("taken", "moves"), [(0.55, True), (0.85, False)])
+    def test_a_single_lane_may_be_filled_farther_than_two_that_are_seen_as_one(
+        self, taken: float, moves: bool, utn17: Network, street_of: Callable[[Make], Network]
+    ) -> None:
+        for street, is_single in ((street_of(odd_nets.actuated), True), (utn17, False)):
+            streams = Streams(street)
+            stream = int(np.flatnonzero(streams.next_link != EXIT)[0])
+            ahead = int(streams.next_link[stream])
+            assert (street.links[ahead].lanes == 1) == is_single
+            x_veh, near_veh = np.zeros(len(street.links)), np.zeros(len(street.lane_sets))
+            x_veh[ahead] = taken * street.storage_veh[ahead]
+            near_veh[streams.lane_set[stream]] = 8.0
+            execution = Scheduled(street)
+            execution.wish(replace(scene(street), set_zone_veh=by_the_line(near_veh), x_veh=x_veh))
+            assert (execution._outlook.sent_veh[stream].sum() > 0.1) == (moves and is_single)
+
     @pytest.mark.parametrize(("ahead", "goes"), [(0.3, "3"), (0.6, "2")])
     def test_who_brings_most_onto_a_road_that_fills_up_waits_however_many_of_them_turn_elsewhere(
         self, ahead: float, goes: str, utn17: Network

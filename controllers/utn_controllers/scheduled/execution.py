@@ -47,7 +47,8 @@ class ScheduledSettings(BaseModel):
     starving: float = Field(1.5, ge=0, le=20)
     """By how much more it costs where nobody has been let go to the last one for two minutes, in shares."""
     full: float = Field(0.4, gt=0, le=2)
-    """Share of its storage about which a link is fed less and less: beyond it some lane is full and stops all."""
+    """Share of its storage about which a link is fed less and less where lanes are seen together: beyond it some lane
+    is full and stops all."""
     standstill_s: float = Field(8.0, ge=2, le=200)
     """How long a queue may have green and nobody go before others are served [s]."""
 

@@ -12,8 +12,8 @@ from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 FADING = 0.2
 """Over what share of its storage about `full` a link is fed less and less."""
 FULL_LANE = 0.7
-"""Share of its own room about which the fullest lanes of a link do the same, however empty the others: who wants to get
-onto them stands before it, in the way of all behind."""
+"""Share of their room about which the fullest lanes of a link do the same, however empty the others: who wants to get
+onto them stands before it, in the way of all behind. Of several lanes that are one set one may be full long before."""
 LEAST_WORTH = 0.05
 """Of a vehicle that would go from an empty link into a full one."""
 HOLDING_BACK = 0.4, 0.5
@@ -46,6 +46,9 @@ class Worth:
         of_link = lanes / np.bincount(network.set_link, lanes, len(network.links))[network.set_link]
         self._lane_room = set_veh + of_link * np.maximum(unseen_veh, 0.0)[network.set_link]
         """(L,) vehicles that the lanes of each set hold, with their part of the link out of sight of their own."""
+        self._merged = np.zeros(len(network.links), dtype=np.bool_)
+        self._merged[network.set_link[lanes > 1]] = True
+        """(Z,) links with lanes of which it is not known which one is how full."""
         self._seen = np.zeros(len(network.lane_sets))
         """(L,) vehicles that were on the lanes of each set in sight when somebody looked last."""
         self._wide = np.array([link.lanes > 1 for link in network.links], dtype=np.bool_)
@@ -87,9 +90,9 @@ class Worth:
             asked, self._set_junction, network.set_link, zones[0], x, self._lane_room, shares.set_of_link, self._seen
         )
         worth, moving = _worth(
-            x, network.storage_veh, fullest, self._dense, network.begins_amid, streams.link, streams.lane_set, streams.group,
-            streams.next_link, shares.of_link, shares.of_set, self._wide, self._late, time_s - self._time_s, most,
-            stuck, held, time_s, self._empty_s, *self._settings,
+            x, network.storage_veh, self._merged, fullest, self._dense, network.begins_amid, streams.link,
+            streams.lane_set, streams.group, streams.next_link, shares.of_link, shares.of_set, self._wide, self._late,
+            time_s - self._time_s, most, stuck, held, time_s, self._empty_s, *self._settings,
         )  # fmt: skip
         self._time_s = time_s
         return worth, moving
@@ -138,9 +141,10 @@ def _lasts(dense: Floats) -> Floats:
 
 @compiled
 def _worth(
-    x: Floats, storage: Floats, fullest: Floats, dense: Floats, amid: Bools, links: Ints, sets: Ints, groups: Ints, next_links: Ints,
-    of_link: Floats, of_set: Floats, wide: Bools, late: Floats, ago_s: float, most: Floats, stuck: Bools, held: Floats,
-    time_s: float, empty_s: Floats, crowding: float, blocking: float, starving: float, full: float,
+    x: Floats, storage: Floats, merged: Bools, fullest: Floats, dense: Floats, amid: Bools, links: Ints, sets: Ints,
+    groups: Ints, next_links: Ints, of_link: Floats, of_set: Floats, wide: Bools, late: Floats, ago_s: float,
+    most: Floats, stuck: Bools, held: Floats, time_s: float, empty_s: Floats, crowding: float, blocking: float,
+    starving: float, full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
     queue, taken = _lasts(dense), x / storage
     # Where nobody sees who waits behind a link, its own vehicles say it.
@@ -162,7 +166,10 @@ def _worth(
         starved = min((time_s - empty_s[sets[stream]]) / STARVED_S, 1.0) ** 2
         worth[stream] = held[groups[stream]] * (1 + starving * starved) * max(value, LEAST_WORTH)
         if ahead != EXIT:
-            fed = (FADING / 2 + min(full - there, FULL_LANE - fullest[ahead])) / FADING
+            room = FULL_LANE - fullest[ahead]
+            if merged[ahead]:
+                room = min(room, full - there)
+            fed = (room + FADING / 2) / FADING
             if fed < 1:
                 moving[stream] = max(fed * most[stream], BLOCKED_VEH)
         if stuck[stream]:
