@@ -10,7 +10,7 @@ from utn_sumo.compiling import compiled
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 FADING = 0.2
-"""Over what share of its storage about `full` a link is fed less and less."""
+"""Over what share about `full` of its storage, or FULL_LANE of a lane's room, a link is fed less and less."""
 FULL_LANE = 0.7
 """Share of their room about which the fullest lanes of a link do the same, however empty the others: who wants to get
 onto them stands before it, in the way of all behind. Of several lanes that are one set one may be full long before."""
