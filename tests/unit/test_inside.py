@@ -243,6 +243,16 @@ def test_who_stands_behind_a_turn_that_shares_its_lane_holds_those_who_would_com
     traffic.standing_veh = defaultdict(float, {ahead: 1.0})
     inside.leads(0, then, first, 23.0)
     assert not inside.holds(0, 23.0)
+    # But who has stood since the green ended is let out, though he has set off.
+    inside.leads(0, first, then, 23.0)
+    traffic.standing_veh = defaultdict(float)
+    assert inside.holds(0, 23.0)
+    traffic.inside_veh = defaultdict(float)
+    assert not inside.holds(0, 24.0)
+    # That was another green.
+    traffic.inside_veh = defaultdict(float, {ahead: 1.0})
+    inside.leads(0, first, then, 23.0)
+    assert not inside.holds(0, 23.0)
 
 
 def test_where_no_turn_gives_way_nobody_is_ever_waited_for(utn17: Network) -> None:

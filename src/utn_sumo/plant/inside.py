@@ -71,6 +71,8 @@ class Inside:
         """By junction and its stages from which and to which they lead."""
         self._ways: dict[int, tuple[Way, float]] = {}
         """On which each junction came to its present stage, and when that begins at the latest."""
+        self._stuck: dict[int, set[int]] = {}
+        """By junction the turns of which somebody has been stuck since it was led to its present stage."""
 
     def may_hold(self) -> Bools:
         """(J,) junctions in which somebody may be left."""
@@ -82,6 +84,16 @@ class Inside:
         if (index, first, then) not in self._known:
             self._known[index, first, then] = self._way(index, first, then)
         self._ways[index] = self._known[index, first, then], opens_s + MOST_HOLD_S
+        self._stuck[index] = set()
+        self._look(index)
+
+    def _look(self, index: int) -> set[int]:
+        """Turns of which nobody is to be amid the junction when its next green begins."""
+        (way, _), stuck = self._ways[index], self._stuck[index]
+        is_walked, stuck_veh = self._network.junctions[index].is_walked, self._areas.stuck_veh
+        # Who has been stuck, and sets off, may have to stop once more before he is out of the way.
+        stuck.update(turn for turn, _ in way.stopped if is_walked or stuck_veh(turn) > 0)
+        return stuck
 
     def _way(self, index: int, first: int, then: int) -> Way:
         network, junction, turnings = self._network, self._network.junctions[index], self._turnings[index]
@@ -112,9 +124,10 @@ class Inside:
         found_no_gap_veh = sum(areas.amid_veh(turn) for turn in way.left)
         if any(found_no_gap_veh > veh and areas.close_veh(group) > 0 for group, veh in way.coming):
             return True
-        is_there = areas.amid_veh if self._network.junctions[index].is_walked else areas.stuck_veh
+        late = self._look(index)
         return any(
-            is_there(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups) for turn, groups in way.stopped
+            turn in late and areas.amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
+            for turn, groups in way.stopped
         )
 
 
