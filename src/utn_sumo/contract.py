@@ -25,6 +25,8 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 EXIT = -1
+CAR_ACCELERATION_M_S2 = 2.6
+"""That of SUMO's passenger cars."""
 MOST_CYCLES = 3
 """Longest cycles between two decisions that junctions with different cycles make necessary."""
 AREA_REACH_M = 200.0
@@ -204,6 +206,8 @@ class Network:
     """Of a part: the control step of the network that it is a part of, which its own cycles need not tell."""
     shortest_m: float = 5.0
     """Length of the shortest vehicle that will drive; a car's where nobody says."""
+    acceleration_m_s2: float = CAR_ACCELERATION_M_S2
+    """How fast queues of those who will drive speed up (`Traffic.acceleration_m_s2`); a car's where nobody says."""
     left_alone: Mapping[str, str] = field(default_factory=dict)
     """Signals that are none of the junctions, and why: they keep the net's own programme."""
 
@@ -546,6 +550,7 @@ class Network:
             edge_lanes=self.edge_lanes,
             edge_length_m=self.edge_length_m,
             startup_lag_s=self.startup_lag_s,
+            acceleration_m_s2=self.acceleration_m_s2,
             whole_step_s=self.control_step_s,
         )
 

@@ -16,6 +16,7 @@ from xml.etree.ElementTree import Element
 
 from utn_sumo import case as cases
 from utn_sumo.case import Case
+from utn_sumo.contract import CAR_ACCELERATION_M_S2
 from utn_sumo.errors import SettingError
 from utn_sumo.network import MOTOR, Traffic
 
@@ -45,6 +46,27 @@ LENGTH_AND_GAP_M = {
 }
 """Length and minGap by vClass where they are not a passenger car's. Source: sumo.dlr.de/docs/
 Vehicle_Type_Parameter_Defaults.html; tests/unit/test_routes.py asks SUMO itself."""
+ACCELERATION_M_S2 = {
+    "pedestrian": 1.5,
+    "bus": 1.2,
+    "coach": 2.0,
+    "truck": 1.3,
+    "trailer": 1.1,
+    "motorcycle": 6.0,
+    "moped": 1.1,
+    "bicycle": 1.2,
+    "tram": 1.0,
+    "rail_urban": 1.0,
+    "rail": 0.25,
+    "rail_electric": 0.5,
+    "rail_fast": 0.5,
+    "ship": 0.1,
+    "wheelchair": 1.5,
+    "scooter": 1.2,
+}
+"""Likewise `accel`, where it is not a passenger car's."""
+SLOWEST_OF_VEH = 3
+"""Those at the head of a queue: behind the slowest of them all the others start."""
 CAR, CAR_M = "passenger", (5.0, 2.5)
 DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 BUILT_IN = {
@@ -99,6 +121,7 @@ class _Kind(NamedTuple):
     vclass: str
     length_m: float
     gap_m: float
+    acceleration_m_s2: float
     scale: float = 1.0
     """How many of each of its vehicles drive."""
 
@@ -117,9 +140,7 @@ class _Reader:
         self.scale = case.scale
         self.path = case.file
         self.ways: dict[str, Shares[_Way]] = {}
-        self.kinds: dict[str, Shares[_Kind]] = {
-            name: [(_Kind(vclass, *LENGTH_AND_GAP_M.get(vclass, CAR_M)), 1.0)] for name, vclass in BUILT_IN.items()
-        }
+        self.kinds: dict[str, Shares[_Kind]] = {name: [(_usual(vclass), 1.0)] for name, vclass in BUILT_IN.items()}
         self.turned_veh: defaultdict[tuple[str, str], float] = defaultdict(float)
         self.trips_veh: defaultdict[tuple[str, ...], float] = defaultdict(float)
         self.named_by: dict[str, str] = {}
@@ -149,12 +170,14 @@ class _Reader:
                 self._drive(way, veh * share, who)
         by_class_veh: defaultdict[str, float] = defaultdict(float)
         space_veh_m, shortest_m = 0.0, CAR_M[0]
+        by_acceleration_veh: defaultdict[float, float] = defaultdict(float)
         for name, (veh, who) in self.by_type.items():
             for kind, share in _known(self.kinds, name, who):
                 driving_veh = veh * share * kind.scale
                 by_class_veh[kind.vclass] += driving_veh
                 if kind.vclass in MOTOR:
                     space_veh_m += driving_veh * (kind.length_m + kind.gap_m)
+                    by_acceleration_veh[kind.acceleration_m_s2] += driving_veh
                 if kind.vclass in (*MOTOR, "bicycle"):
                     shortest_m = min(shortest_m, kind.length_m)
         total_veh = sum(veh for vclass, veh in by_class_veh.items() if vclass in MOTOR)
@@ -164,6 +187,7 @@ class _Reader:
             by_class_veh=dict(by_class_veh),
             trips_veh=dict(self.trips_veh),
             shortest_m=shortest_m,
+            acceleration_m_s2=_of_queues_m_s2(by_acceleration_veh) if total_veh else CAR_ACCELERATION_M_S2,
             named_by=self.named_by,
             called=frozenset(self.called),
         )
@@ -256,10 +280,18 @@ class _Reader:
 
     def _kind(self, element: Element) -> Shares[_Kind]:
         """A type, which goes by its own name too where it stands in a distribution."""
-        vclass = element.get("vClass", CAR)
-        length_m, gap_m = LENGTH_AND_GAP_M.get(vclass, CAR_M)
-        size = self._number(element, "length", length_m), self._number(element, "minGap", gap_m)
-        kind = [(_Kind(vclass, *size, self._number(element, "scale", 1.0)), 1.0)]
+        usual = _usual(element.get("vClass", CAR))
+        acceleration_m_s2 = self._number(element, "accel", usual.acceleration_m_s2)
+        if not acceleration_m_s2 > 0:
+            self._refuse(element, "has accel 0: give it more")
+        own = _Kind(
+            usual.vclass,
+            self._number(element, "length", usual.length_m),
+            self._number(element, "minGap", usual.gap_m),
+            acceleration_m_s2,
+            self._number(element, "scale", usual.scale),
+        )
+        kind = [(own, 1.0)]
         self.kinds[element.get("id", "")] = kind
         return kind
 
@@ -315,6 +347,21 @@ class _Reader:
 
     def _refuse(self, element: Element, what: str) -> NoReturn:
         raise SettingError(f"{self._name(element)} {what}")
+
+
+def _usual(vclass: str) -> _Kind:
+    acceleration_m_s2 = ACCELERATION_M_S2.get(vclass, CAR_ACCELERATION_M_S2)
+    return _Kind(vclass, *LENGTH_AND_GAP_M.get(vclass, CAR_M), acceleration_m_s2)
+
+
+def _of_queues_m_s2(by_acceleration_veh: Mapping[float, float]) -> float:
+    """Harmonic mean of the slowest of SLOWEST_OF_VEH vehicles, of which so many accelerate by as much."""
+    total_veh, faster_veh, slowest_s2_m = sum(by_acceleration_veh.values()), 0.0, 0.0
+    for acceleration_m_s2, veh in sorted(by_acceleration_veh.items(), reverse=True):
+        before, faster_veh = faster_veh, faster_veh + veh
+        slowest = (faster_veh / total_veh) ** SLOWEST_OF_VEH - (before / total_veh) ** SLOWEST_OF_VEH
+        slowest_s2_m += slowest / acceleration_m_s2
+    return 1 / slowest_s2_m
 
 
 def _known(table: Mapping[str, Shares[T]], name: str, who: str) -> Shares[T]:

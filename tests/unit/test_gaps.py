@@ -137,6 +137,18 @@ def test_left_turns_without_a_stage_of_their_own_wait_for_who_comes_straight_on(
     assert gaps.some.any()
 
 
+def test_nobody_waits_for_gaps_on_lanes_from_which_hardly_anybody_turns(street_of: StreetOf) -> None:
+    network = street_of(odd_nets.plain)
+    streams = Streams(network)
+    none = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=bool)
+    held = np.zeros((len(streams.stage), int(np.diff(streams.first).max())), dtype=bool)
+    giving = Giving(network, streams, none, 2.0, held)
+    for share, waits in ((0.3, True), (0.02, True), (0.002, False)):
+        of_set = streams.shares(network.fraction).way_of_set
+        giving.take_up(np.where(of_set < 1, share, of_set))
+        assert (giving.gaps.waiting > 0).any() == giving.gaps.some.any() == waits
+
+
 def test_nobody_counts_as_gone_with_his_green_where_he_goes_on_while_who_walks_is_cleared(street_of: StreetOf) -> None:
     for make, goes_on in ((odd_nets.pedestrians, True), (odd_nets.plain, False)):
         gaps = Scheduled(street_of(make))._giving.gaps

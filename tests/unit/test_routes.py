@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from utn_sumo import case, routes
 from utn_sumo.case import Case
-from utn_sumo.contract import Network
+from utn_sumo.contract import CAR_ACCELERATION_M_S2, Network
 from utn_sumo.errors import SettingError
 from utn_sumo.routes import Traffic
 from utn_sumo.sumo_tools import sumo_binary
@@ -134,7 +134,7 @@ def test_windows_side_by_side_hold_what_the_whole_holds(
 def test_departures_outside_the_window_weigh_nothing(content: str, tmp_path: Path) -> None:
     found = traffic(tmp_path, content, begin_s=100.0, end_s=200.0)
     assert (found.turned_veh, found.by_class_veh, found.named_by) == ({}, {}, {})
-    assert (found.space_m, found.shortest_m) == (7.5, 5.0)
+    assert (found.space_m, found.shortest_m, found.acceleration_m_s2) == (7.5, 5.0, 2.6)
 
 
 def test_what_sumo_scales_is_scaled(tmp_path: Path) -> None:
@@ -177,9 +177,20 @@ def test_room_is_the_mean_of_what_drives(tmp_path: Path) -> None:
     assert found.shortest_m <= 5.0
 
 
-def test_lengths_and_gaps_are_sumo_s_own(utn17: Network, tmp_path: Path) -> None:
+def test_queues_speed_up_as_the_slowest_at_their_head(tmp_path: Path) -> None:
+    cars = f'<flow id="a" number="3" type="car">{OWN}</flow><flow id="b" number="1" type="slow">{OWN}</flow>'
+    types = '<vType id="car"/><vType id="slow" accel="0.8"/><vType id="tram" vClass="tram"/>'
+    found = traffic(tmp_path, types + cars + f'<vehicle id="t" depart="0" type="tram">{OWN}</vehicle>')
+    of_one, of_all = 1 - 0.75**3, 0.75**3
+    assert 1 / found.acceleration_m_s2 == pytest.approx(of_one / 0.8 + of_all / 2.6)
+    alike = traffic(tmp_path, f'<vType id="car" accel="1.5"/><flow id="a" number="3" type="car">{OWN}</flow>')
+    assert alike.acceleration_m_s2 == pytest.approx(1.5)
+
+
+def test_lengths_gaps_and_accelerations_are_sumo_s_own(utn17: Network, tmp_path: Path) -> None:
     import libsumo
 
+    assert routes.ACCELERATION_M_S2.keys() <= routes.LENGTH_AND_GAP_M.keys()
     classes = [*routes.LENGTH_AND_GAP_M, "passenger", "taxi", "hov", "evehicle", "ignoring", "custom1"]
     types = "".join(f'<vType id="{vclass}" vClass="{vclass}"/>' for vclass in classes)
     (tmp_path / "types.add.xml").write_text(f"<additional>{types}</additional>", encoding="utf-8")
@@ -187,10 +198,13 @@ def test_lengths_and_gaps_are_sumo_s_own(utn17: Network, tmp_path: Path) -> None
     try:
         ask = libsumo.vehicletype
         theirs = {vclass: (ask.getLength(vclass), ask.getMinGap(vclass)) for vclass in classes}
+        acceleration_m_s2 = {vclass: ask.getAccel(vclass) for vclass in classes}
         built_in = {name: ask.getVehicleClass(name) for name in ask.getIDList() if name.startswith("DEFAULT_")}
     finally:
         libsumo.close()
     assert theirs == {vclass: routes.LENGTH_AND_GAP_M.get(vclass, routes.CAR_M) for vclass in classes}
+    usual = CAR_ACCELERATION_M_S2
+    assert acceleration_m_s2 == {vclass: routes.ACCELERATION_M_S2.get(vclass, usual) for vclass in classes}
     assert built_in == routes.BUILT_IN
 
 

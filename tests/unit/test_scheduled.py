@@ -569,7 +569,7 @@ class TestEnding:
 
     def test_the_more_the_clearances_take_the_more_it_weighs(self, utn17: Network) -> None:
         streams = Streams(utn17)
-        clearance = Moves(utn17, streams, 2).bins
+        clearance = Moves(utn17, streams, 2, are_alone(utn17, streams)).bins
         come = np.linspace(0.1, 0.4, len(streams.link))
         needed = []
         for times in (0, 1, 2):
@@ -662,24 +662,44 @@ class TestEnding:
 class TestMoves:
     def test_they_are_the_stages_greens_first(self, net: Network) -> None:
         streams = Streams(net)
-        moves = Moves(net, streams, 2)
+        moves = Moves(net, streams, 2, are_alone(net, streams))
         for row, junction in enumerate(net.stage_junction[streams.stage]):
             a, b = streams.first[junction], streams.first[junction + 1]
             assert (moves.share[row, : b - a] == streams.serves[row, a:b]).all()
             assert not moves.share[row, b - a :].any()
 
     def test_nobody_moves_where_all_lose_green(self, utn17: Network) -> None:
-        moves = Moves(utn17, Streams(utn17), 2)
+        streams = Streams(utn17)
+        moves = Moves(utn17, streams, 2, are_alone(utn17, streams))
         assert (moves.row == -1).all()
         assert len(moves.share) == len(utn17.stages)
         # Three seconds of yellow and two of red, rounded up.
         counts = [len(junction.stages) for junction in utn17.junctions]
         assert (moves.bins == 3).sum() == sum(count * (count - 1) for count in counts)
 
+    @pytest.mark.parametrize("acceleration_m_s2", [2.6, 2.45, 1.4, 0.8, 0.02])
+    def test_green_begins_as_much_later_as_queues_that_speed_up_slowly_start(
+        self, acceleration_m_s2: float, street_of: Callable[[Make], Network]
+    ) -> None:
+        cars = street_of(odd_nets.plain)
+        slow = replace(cars, acceleration_m_s2=acceleration_m_s2)
+        streams = Streams(cars)
+        behind_s = 50 / 3.6 / 2 * (1 / acceleration_m_s2 - 1 / 2.6)
+        for alone, lost_s in ((True, min(behind_s, 10.0)), (False, min(behind_s / 2, 10.0))):
+            usual, late = (Moves(each, streams, 2, np.array([alone])) for each in (cars, slow))
+            for row, then in ((0, 1), (1, 0)):
+                more, begins = late.bins[row, then] - usual.bins[row, then], late.row[row, then]
+                all_red = begins == -1
+                rows = late.share[begins + usual.bins[row, then] :][:more] * (not all_red)
+                served = streams.serves[streams.stage == cars.junctions[0].stages[then]][0]
+                assert 2 * (more - rows[:, served].sum(axis=0)) == pytest.approx(lost_s, abs=0.5)
+                # Nobody goes whose green has ended.
+                assert not rows[:, ~served].any()
+
     def test_vehicles_go_on_while_who_walks_is_cleared(self, street_of: Callable[[Make], Network]) -> None:
         network = street_of(odd_nets.pedestrians)
         streams = Streams(network)
-        moves = Moves(network, streams, 2)
+        moves = Moves(network, streams, 2, are_alone(network, streams))
         held = [index for index, stage in enumerate(network.stages) if any(stage.held)]
         assert held
         for stage in held:

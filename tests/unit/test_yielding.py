@@ -12,6 +12,7 @@ import pytest
 
 from tests.integration import odd_nets
 from tests.unit.views import by_the_line, scene
+from utn_controllers.scheduled.ending import are_alone
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.moves import Moves
 from utn_controllers.scheduled.streams import Streams
@@ -81,7 +82,7 @@ def test_who_never_has_a_stage_alone_is_left_as_it_is(make: Make, street_of: Str
 @pytest.mark.parametrize("flow", [0.0, 0.3, 1.0])
 def test_its_share_is_what_has_gone_of_late_and_is_forgotten(flow: float, arrows: Network) -> None:
     streams = Streams(arrows)
-    moves = Moves(arrows, streams, 2).share
+    moves = Moves(arrows, streams, 2, are_alone(arrows, streams)).share
     learning, group = Yielding(arrows, streams, moves), left_turns(arrows)[0]
     stage = through_stage(arrows, group)
     row, junction = np.array([streams.stage.tolist().index(stage)]), np.array([True])
@@ -140,7 +141,7 @@ def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_
 ) -> None:
     network = street_of(an_arrow_for_a_shared_lane)
     streams = Streams(network)
-    moves = Moves(network, streams, 2).share
+    moves = Moves(network, streams, 2, are_alone(network, streams)).share
     learning = Yielding(network, streams, moves)
     arrow = next(row for row, stage in enumerate(streams.stage) if "g" not in network.stages[stage].state)
     turning = np.flatnonzero(streams.serves[arrow])
@@ -170,7 +171,7 @@ def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_
 def test_short_greens_in_which_nobody_goes_add_up_for_all_stages_that_serve_no_more(street_of: StreetOf) -> None:
     network = street_of(parts_of_a_lane)
     streams = Streams(network)
-    moves = Moves(network, streams, 2).share
+    moves = Moves(network, streams, 2, are_alone(network, streams)).share
     learning = Yielding(network, streams, moves)
     shown = [network.stages[stage].state for stage in streams.stage]
     most, right, left = (shown.index(each) for each in ("GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrrrrr"))

@@ -65,9 +65,9 @@ class Scheduled:
         self.every_s = BIN_S
         self._streams = Streams(network)
         self._calling = Calling(network, self._streams)
-        moves = Moves(network, self._calling, BIN_S)
-        lost_bins = lost(self._streams.first_stage, moves.bins)
         alone = are_alone(network, self._streams)
+        moves = Moves(network, self._calling, BIN_S, alone)
+        lost_bins = lost(self._streams.first_stage, moves.bins)
         ahead = ahead_bins(alone, round(self.settings.horizon_s / BIN_S), lost_bins)
         bins = int(ahead.max())
         self._outlook = Outlook(network, self._streams, bins, BIN_S)

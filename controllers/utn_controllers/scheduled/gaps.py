@@ -46,6 +46,8 @@ NO_GAP_VEH = 20.0
 """With so many coming while a gap must last there is none."""
 SOME_VEH = 1e-3
 """With fewer than so many nobody waits for one."""
+SOME_SHARE = 0.01
+"""Of a lane's traffic: fewer who would wait for gaps are none."""
 AMID_VEH = 2.0
 """Of a lane on which somebody waits, as its green ends: they go with the yellow, as in the Highway Capacity Manual."""
 
@@ -139,6 +141,7 @@ class Giving:
             alike = streams.lane_set[first:last, None] == streams.lane_set[streams.way_stream[ways]]
             for row in range(*streams.first_stage[junction : junction + 2]):
                 own = alike @ (of_set[ways] * self._waits[row, ways]) * streams.serves[row, first:last]
+                own[own < SOME_SHARE] = 0.0
                 self.gaps.waiting[row, : last - first] = own
                 self.gaps.some[row] = (own > 0).any()
 

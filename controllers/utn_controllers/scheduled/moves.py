@@ -1,11 +1,14 @@
 """What moves at a junction in each bin of a stage, and of the clearance from any stage to any other.
 
+Queues of those who speed up slowly start later than others: the first seconds of their green are clearance, too.
+
 Many a clearance is no red for all: vehicles go on while who walks is cleared, a stream that the next stage serves too
 keeps its green, another has it a little before its stage.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +18,15 @@ from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo import clearances
 from utn_sumo.clearances import GREEN, Phases, Times
-from utn_sumo.contract import Bools, Floats, Ints, Network
+from utn_sumo.contract import CAR_ACCELERATION_M_S2, Bools, Floats, Ints, Network
+
+STARTING_S_M_S2 = 50 / 3.6 / 2
+"""Who starts is behind those who drive 50 km/h on by half of the time that it takes to speed up to that."""
+ROLLING = 0.5
+"""Of those who come from another junction, in platoons that green waits for: they do not start at the line."""
+LEAST_BINS, MOST_BINS = 0.25, 5.0
+"""What starting takes is nothing where it is less, as for cars with some trucks among them, and never more: schedules
+have to reach the stages behind it."""
 
 
 class Rules(NamedTuple):
@@ -51,9 +62,11 @@ class Rules(NamedTuple):
 class Moves:
     """Which share of its discharge each stream of a junction has, by bins, in rows (R): the stages', clearances'."""
 
-    def __init__(self, network: Network, streams: Streams | Calling, bin_s: int):
+    def __init__(self, network: Network, streams: Streams | Calling, bin_s: int, alone: Bools):
+        """`alone` (J,) says of junctions that nobody comes to them from another one."""
         sizes, most = np.diff(streams.first), int(np.diff(streams.first_stage).max(initial=1))
         owner = network.stage_junction[streams.stage]
+        starting_bins = STARTING_S_M_S2 * (1 / network.acceleration_m_s2 - 1 / CAR_ACCELERATION_M_S2) / bin_s
         rows = [
             serves[streams.first[j] : streams.first[j + 1]] for j, serves in zip(owner, streams.serves, strict=True)
         ]
@@ -64,12 +77,15 @@ class Moves:
         for index, junction in enumerate(network.junctions):
             letters = streams.letters[streams.first[index] : streams.first[index + 1]]
             times = Times.of(network, junction)
+            late_bins = starting_bins * (1.0 if alone[index] else 1 - ROLLING)
             for row, first in enumerate(junction.stages, start=streams.first_stage[index]):
                 known: dict[bytes, int] = {}
                 for place, then in enumerate(junction.stages):
                     if first != then:
                         phases = clearances.between(network, junction, times, first, then)
                         shares = _shares(phases, letters, bin_s)
+                        own = rows[streams.first_stage[index] + place]
+                        shares = np.concatenate([shares, _starting(own, rows[row], late_bins)])
                         self.bins[row, place] = len(shares)
                         if shares.any():
                             self.row[row, place] = known.setdefault(shares.tobytes(), len(rows))
@@ -85,6 +101,17 @@ class Moves:
             self.held |= (begins >= 0)[:, None] & (self.share[begins] > 0)
         self.going = going(self.share, len(owner), self.row, self.bins)
         """(R, most streams of a junction + 1) as in `Rules`."""
+
+
+def _starting(own: Bools, before: Bools, bins: float) -> Floats:
+    """(bins, streams) share of each bin that those have who start in it, and lose so many `bins` by that.
+
+    They are the stage's `own` (streams,); who had green `before` (streams,) goes on.
+    """
+    bins = min(bins, MOST_BINS)
+    many = max(math.ceil(bins - LEAST_BINS), 0)
+    going_on = own & before
+    return np.tile(np.where(going_on, 1.0, own * max(1 - bins / max(many, 1), 0.0)), (many, 1))
 
 
 def going(share: Floats, stages: int, row: Ints, bins: Ints) -> Ints:

@@ -174,6 +174,7 @@ class _Reader:
         self.coming_veh = None if traffic is None else _coming_veh(net, traffic)
         self.space_m = SPACE_PER_VEHICLE_M if traffic is None else traffic.space_m
         self.shortest_m = Network.shortest_m if traffic is None else traffic.shortest_m
+        self.acceleration_m_s2 = Network.acceleration_m_s2 if traffic is None else traffic.acceleration_m_s2
         # Approach edge -> position of the junction that it enters.
         self.junction_of = {edge: position for position, signal in enumerate(signals) for edge in signal.approaches}
         self.approaches = sorted(self.junction_of, key=_natural)
@@ -224,6 +225,7 @@ class _Reader:
             edge_length_m={edge: self.net.getEdge(edge).getLength() for edge in edges},
             startup_lag_s=STARTUP_LAG_S,
             shortest_m=self.shortest_m,
+            acceleration_m_s2=self.acceleration_m_s2,
             left_alone=left_alone,
         )
 

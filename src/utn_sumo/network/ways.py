@@ -40,6 +40,9 @@ class Traffic:
     `turned_veh`. What begins or ends elsewhere than on an edge has fewer than two."""
     shortest_m: float
     """Length of the shortest vehicle that drives on a road; a passenger car's where none is shorter."""
+    acceleration_m_s2: float
+    """How fast queues of motor vehicles speed up: harmonic mean of the slowest of SLOWEST_OF_VEH, a passenger car's
+    where nobody drives."""
     named_by: Mapping[str, str]
     """Edges on their ways, as far as these are known, and who names each of them first."""
     called: frozenset[str] = frozenset()
