@@ -48,8 +48,9 @@ SOME_VEH = 1e-3
 """With fewer than so many nobody waits for one."""
 SOME_SHARE = 0.01
 """Of a lane's traffic: fewer who would wait for gaps are none."""
-AMID_VEH = 2.0
-"""Of a lane on which somebody waits, as its green ends: they go with the yellow, as in the Highway Capacity Manual."""
+AMID_VEH = 1.0
+"""Of a lane on which somebody waits, as its green ends, as in the Highway Capacity Manual: of the two that it counts
+one has found a gap, as a rule."""
 
 
 class Gaps(NamedTuple):
