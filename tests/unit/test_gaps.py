@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 from tests.integration import odd_nets
 from tests.unit.views import by_the_line, scene
 from utn_controllers.scheduled.execution import Scheduled
-from utn_controllers.scheduled.gaps import GAP_S, HEADWAY_S, Gaps, Giving, clear, headways, let_go
+from utn_controllers.scheduled.gaps import AMID_VEH, GAP_S, HEADWAY_S, Gaps, Giving, clear, headways, let_go
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.contract import Network
@@ -153,7 +153,7 @@ def test_nobody_counts_as_gone_with_his_green_where_he_goes_on_while_who_walks_i
     for make, goes_on in ((odd_nets.pedestrians, True), (odd_nets.plain, False)):
         gaps = Scheduled(street_of(make))._giving.gaps
         assert (gaps.waiting > 0).any()
-        assert (gaps.amid_veh[gaps.waiting > 0] == (0.0 if goes_on else 2.0)).all()
+        assert (gaps.amid_veh[gaps.waiting > 0] == (0.0 if goes_on else AMID_VEH)).all()
 
 
 def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(street_of: StreetOf) -> None:
