@@ -126,38 +126,53 @@ def test_who_waits_amid_a_junction_is_let_out_before_the_next_road_comes_under_s
     assert delay_s[1] < 0.7 * delay_s[0] if better else delay_s[1] == delay_s[0]
 
 
-def slow_starters(folder: Path) -> Path:
-    """A crossing of two lanes a road where left turns, which nobody takes, give way; cars speed up slowly."""
+def two_roads(
+    folder: Path, rates_veh_s: tuple[float, float], left_share: float, accel: float = 2.6, *options: str
+) -> Path:
+    """A crossing of two lanes a road where left turns give way: traffic of the arms E and W, of N and S."""
     streets = odd_nets.Streets()
     streets.node("C", 0, 0, "traffic_light")
     places = {"N": (0, 300), "E": (300, 0), "S": (0, -300), "W": (-300, 0)}
     arms = list(places)
-    routes = '<vType id="slow" accel="1.4"/>'
+    routes = f'<vType id="cars" accel="{accel}"/>'
     for place, (arm, at) in enumerate(places.items()):
         streets.node(arm, *at)
         streets.one_way(arm, "C", 2)
         streets.one_way("C", arm, 2)
         left, ahead, right = (arms[(place + step) % 4] for step in (1, 2, 3))
-        streets.connection(f"{arm}-C", f"C-{left}", fromLane=1, toLane=1)
-        for to, share in ((ahead, 0.8), (right, 0.2)):
-            for lane in (0, 1) if to == ahead else (0,):
+        for to, lanes, share in ((left, (1,), left_share), (ahead, (0, 1), 0.8 - left_share), (right, (0,), 0.2)):
+            for lane in lanes:
                 streets.connection(f"{arm}-C", f"C-{to}", fromLane=lane, toLane=lane)
-            rate_veh_s = share * (0.47 if arm in "EW" else 0.33)
-            said = {"type": "slow", "period": f"exp({rate_veh_s:.5f})", "departLane": "best", "end": 1800}
-            routes += odd_nets.flow(f"{arm}{to}", f"{arm}-C", f"C-{to}", **said)
-    streets.net(folder, odd_nets.NO_TURNAROUNDS)
+            if share > 0:
+                rate_veh_s = share * rates_veh_s[arm in "NS"]
+                said = {"type": "cars", "period": f"exp({rate_veh_s:.5f})", "departLane": "best", "end": 1800}
+                routes += odd_nets.flow(f"{arm}{to}", f"{arm}-C", f"C-{to}", **said)
+    streets.net(folder, odd_nets.NO_TURNAROUNDS, *options)
     return odd_nets.case(folder, routes, end="2400")
 
 
 @pytest.mark.long
 def test_greens_are_long_enough_for_those_who_speed_up_slowly(tmp_path: Path) -> None:
-    net, delay_s = str(slow_starters(tmp_path)), dict.fromkeys(("recommended", "delay_based"), 0.0)
+    net, delay_s = str(two_roads(tmp_path, (0.47, 0.33), 0.0, 1.4)), dict.fromkeys(("recommended", "delay_based"), 0.0)
     for name in delay_s:
         for seed in (1, 2, 3):
             result = bridge.run(scenario(net=net, controller=name, seed=seed), tmp_path / f"{name}-{seed}")
             delay_s[name] += result["mean_delay_s"] / 3
     # As for other cars, in short greens most of which goes by until they have started, it was three times that.
     assert delay_s["recommended"] < delay_s["delay_based"]
+
+
+@pytest.mark.long
+def test_greens_are_long_enough_for_left_turns_to_find_gaps_where_clearances_are_long(tmp_path: Path) -> None:
+    long_clearances = ("--tls.yellow.time", "6", "--tls.allred.time", "2")
+    net = str(two_roads(tmp_path, (0.2145, 0.1485), 0.2, 2.6, *long_clearances))
+    delay_s = dict.fromkeys(("recommended", "actuated"), 0.0)
+    for name in delay_s:
+        for seed in (1, 2, 3):
+            result = bridge.run(scenario(net=net, controller=name, seed=seed), tmp_path / f"{name}-{seed}")
+            delay_s[name] += result["mean_delay_s"] / 3
+    # With two of each lane thought to go as their green ends it was more.
+    assert delay_s["recommended"] < delay_s["actuated"]
 
 
 @pytest.mark.long

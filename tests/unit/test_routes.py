@@ -263,6 +263,7 @@ def test_of_a_type_with_a_scale_so_many_drive(tmp_path: Path) -> None:
         (f'<flow id="f" period="0">{OWN}</flow>', "has period '0': give more than 0 s"),
         (f'<flow id="f" period="exp(x)">{OWN}</flow>', r"has period 'x': give a number"),
         (f'<flow id="f" vehsPerHour="x">{OWN}</flow>', "has vehsPerHour 'x'"),
+        ('<vType id="v" accel="0"/>', "vType 'v' of .* has accel 0: give it more"),
         (f'<flow id="f">{OWN}</flow>', "flow 'f' .* neither number nor period"),
         ('<vType id="t" length="long"/>', "vType 't' .* has length 'long'"),
         ('<route id="r"/>', "route 'r' .* has no edges"),

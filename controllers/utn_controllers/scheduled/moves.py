@@ -63,7 +63,7 @@ class Moves:
     """Which share of its discharge each stream of a junction has, by bins, in rows (R): the stages', clearances'."""
 
     def __init__(self, network: Network, streams: Streams | Calling, bin_s: int, alone: Bools):
-        """`alone` (J,) says of junctions that nobody comes to them from another one."""
+        """`alone` (J,) are those of `are_alone`: all who come to them start at the line."""
         sizes, most = np.diff(streams.first), int(np.diff(streams.first_stage).max(initial=1))
         owner = network.stage_junction[streams.stage]
         starting_bins = STARTING_S_M_S2 * (1 / network.acceleration_m_s2 - 1 / CAR_ACCELERATION_M_S2) / bin_s
