@@ -41,6 +41,7 @@ def queues(
         np.array([True]),
         np.array([[beside, False]]),
         np.ones((1, 2)),
+        np.ones((1, 2)),
         2.0,
     )
     veh, come = np.array([10.0, towards_veh]), np.zeros((2, BINS))
@@ -97,17 +98,17 @@ def test_nobody_waits_without_oncoming_traffic_and_for_ever_where_it_never_ends(
     assert headways(1e3) == np.inf
 
 
-@given(pace=st.floats(0.0, 1.0), queued_veh=st.floats(0.0, 9.0), lanes=st.integers(1, 3))
-def test_two_of_a_lane_that_stands_for_a_gap_go_as_its_green_ends_and_none_of_one_that_goes(
-    pace: float, queued_veh: float, lanes: int
+@given(pace=st.floats(0.0, 1.0), to_come=st.floats(0.0, 1.0), queued_veh=st.floats(0.0, 9.0), lanes=st.integers(1, 3))
+def test_two_of_a_lane_that_stands_for_a_gap_go_as_its_green_ends_and_none_of_one_that_goes_or_has_stood(
+    pace: float, to_come: float, queued_veh: float, lanes: int
 ) -> None:
     gaps = Gaps(
         np.array([[0.3, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.full((1, 2), 2.0), np.array([True]),
-        np.array([[False, False]]), np.ones((1, 2)), 2.0,
+        np.array([[False, False]]), np.ones((1, 2)), np.ones((1, 2)), 2.0,
     )  # fmt: skip
     veh, amid, going = np.array([queued_veh, 5.0]), np.ones(2), np.array([[0, 1, -1]])
-    clear(0, veh, np.full(2, float(lanes)), going, gaps, np.array([pace, 0.0]), amid)
-    assert amid[0] == pytest.approx(min(2 * lanes * (1 - pace), queued_veh))
+    clear(0, veh, np.full(2, float(lanes)), going, gaps, np.array([pace, 0.0]), np.array([to_come, 1.0]), amid)
+    assert amid[0] == pytest.approx(min(2 * lanes * max(to_come - pace, 0.0), queued_veh))
     assert (amid[1], veh[1]) == (0, 5)
     assert veh[0] + amid[0] == pytest.approx(queued_veh)
 
@@ -142,7 +143,7 @@ def test_nobody_waits_for_gaps_on_lanes_from_which_hardly_anybody_turns(street_o
     streams = Streams(network)
     none = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=bool)
     held = np.zeros((len(streams.stage), int(np.diff(streams.first).max())), dtype=bool)
-    giving = Giving(network, streams, none, 2.0, held)
+    giving = Giving(network, streams, none, 2.0, held, np.ones(1, dtype=bool))
     for share, waits in ((0.3, True), (0.02, True), (0.002, False)):
         of_set = streams.shares(network.fraction).way_of_set
         giving.take_up(np.where(of_set < 1, share, of_set))
@@ -156,11 +157,14 @@ def test_nobody_counts_as_gone_with_his_green_where_he_goes_on_while_who_walks_i
         assert (gaps.amid_veh[gaps.waiting > 0] == (0.0 if goes_on else AMID_VEH)).all()
 
 
-def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(street_of: StreetOf) -> None:
+@pytest.mark.parametrize("alone", [True, False])
+def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
+    alone: bool, street_of: StreetOf
+) -> None:
     network = street_of(odd_nets.two_lanes)
     streams, stages = Streams(network), network.junctions[0].stages
     learnt, held = (np.zeros((len(stages), count), dtype=bool) for count in (len(network.lane_sets), len(streams.link)))
-    giving = Giving(network, streams, learnt, 2.0, held)
+    giving = Giving(network, streams, learnt, 2.0, held, np.full(1, alone))
     giving.take_up(streams.shares(network.fraction).way_of_set)
     rows, everywhere = np.argsort(streams.stage), np.ones(1, dtype=bool)
     waiting, seen = by_the_line(np.full(len(network.lane_sets), 5.0)), []
@@ -174,6 +178,9 @@ def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
         shown = giving.gaps.flowing[rows[stage], : len(streams.link)]
         assert (shown[streams.lane_set != stands] == 1).all()
         seen.append(float(shown[streams.lane_set == stands][0]))
+        # Who waits there has left it: nobody more goes as this green ends.
+        to_come, waits = giving.gaps.to_come[rows[stage]], giving.gaps.waiting[rows[stage]] > 0
+        assert (to_come == np.where(waits & alone, shown, 1)).all()
     assert seen[:3] == [1.0, 1.0, 1.0]
     assert seen[14] < 0.1
     assert seen[16:18] == [1.0, 1.0]

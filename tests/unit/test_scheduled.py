@@ -55,6 +55,8 @@ class Crossing:
     """That go of each lane on which somebody waits as its green ends."""
     flowing: float = 1.0
     """Share of their discharge that all lanes have had of late in the stage that is shown."""
+    to_come: float = 1.0
+    """Share of all lanes there whose first to wait is still to come."""
     staying: float = 5.0
     """Bins that who is left at the end waits longer."""
     needing: tuple[float, ...] = ()
@@ -106,6 +108,7 @@ class Crossing:
             (waiting > 0).any(axis=1),
             np.zeros(shape, dtype=np.bool_),
             np.full(shape, self.flowing),
+            np.full(shape, self.to_come),
             2.0,
         )
         return Rules(
@@ -286,7 +289,8 @@ def giving_way(draw: st.DrawFn) -> Drawn:
     drawn = draw(holding())
     pairs = st.tuples(*[st.integers(0, len(drawn[1]) - 1)] * 2)
     waits = draw(st.dictionaries(pairs, st.sampled_from([0.2, 1.0]), min_size=1, max_size=3))
-    return replace(drawn[0], waits=waits, flowing=draw(st.sampled_from([0.1, 1.0]))), *drawn[1:]
+    flowing, to_come = draw(st.sampled_from([(0.1, 0.1), (0.1, 1.0), (1.0, 1.0)]))
+    return replace(drawn[0], waits=waits, flowing=flowing, to_come=to_come), *drawn[1:]
 
 
 class TestProgramme:

@@ -7,6 +7,10 @@ faster as fewer of it wait.
 Who waits does so amid the junction, and clears it when the green ends, and who is behind him with the yellow: where
 nobody finds a gap, that is all who go (the Highway Capacity Manual's sneakers), and the more greens the more.
 
+Who waits amid the junction has left his lane already, and who is behind him will not go in this green: where a lane is
+seen to stand, nobody of it goes as the present green ends. Only junctions by themselves go by that: a street of several
+with short clearances had 1.03 times the delay.
+
 With other lanes beside it that average will not do: a lane goes until the first who waits comes to its front, then it
 stands while the others go, and a green that is kept for what it would let go on average is kept for long. Which lanes
 stand in the present green is seen by who has left them.
@@ -69,6 +73,9 @@ class Gaps(NamedTuple):
     flowing: Floats
     """(S, most streams of a junction) share of its discharge that it is thought to have in the stage that is shown: as
     its lanes have had of late where somebody waits or stands, otherwise all."""
+    to_come: Floats
+    """(S, most streams of a junction) share of its lanes whose first to wait is still to come in the stage that is
+    shown: of all in the others."""
     per_veh: float
     """By what power of e fewer go for each vehicle in a bin that comes towards them."""
 
@@ -76,8 +83,11 @@ class Gaps(NamedTuple):
 class Giving:
     """Keeps which share of each lane set waits for gaps."""
 
-    def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, held: Bools):
-        """But for lane sets whose discharge in a stage is `learnt` (S, L). Who is `held`, as in Moves, goes on."""
+    def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, held: Bools, alone: Bools):
+        """But for lane sets whose discharge in a stage is `learnt` (S, L). Who is `held`, as in Moves, goes on.
+
+        Junctions are `alone` (J,) as of `are_alone`.
+        """
         self._streams = streams
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
         """(S, V) signalled ways that wait for gaps in a stage."""
@@ -100,6 +110,7 @@ class Giving:
             some=np.zeros(shape[0], dtype=np.bool_),
             beside=np.zeros(shape, dtype=np.bool_),
             flowing=np.ones(shape),
+            to_come=np.ones(shape),
             per_veh=GAP_S / bin_s,
         )
         sets_of_link = np.bincount(network.set_link, minlength=len(network.links))
@@ -109,7 +120,7 @@ class Giving:
                 found = sorted(foes.get((row, int(streams.lane_set[stream])), ()))
                 self.gaps.foes[row, stream - first, : len(found)] = np.array(found, dtype=np.int64) - first
                 self.gaps.beside[row, stream - first] = sets_of_link[streams.link[stream]] > 1
-        self._network = network
+        self._network, self._alone = network, alone
         self._flowing = np.ones(len(network.lane_sets))
         """(L,) share of its discharge that each lane set has had of late in the green that it has."""
         self._queued = np.zeros(len(network.lane_sets), dtype=np.bool_)
@@ -129,7 +140,7 @@ class Giving:
             network, streams = self._network, self._streams
             _see(
                 view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0], view.x_veh >= self._full_veh,
-                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._flowing,
+                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._alone, self._flowing,
                 self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.next_link, streams.first,
                 self.gaps,
             )  # fmt: skip
@@ -165,7 +176,7 @@ def _foes(network: Network, streams: Streams, row: int, stage: int, way: int) ->
 @compiled
 def _see(
     time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, full: Bools,
-    flow: Floats, set_junction: Ints, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats,
+    flow: Floats, set_junction: Ints, alone: Bools, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats,
     stream_set: Ints, next_link: Ints, first: Ints, gaps: Gaps,
 ) -> None:  # fmt: skip
     behind = np.zeros(len(flowing), np.bool_)
@@ -191,6 +202,8 @@ def _see(
                 own, share = stream - first[junction], flowing[stream_set[stream]]
                 stands = gaps.waiting[row, own] > 0 or behind[stream_set[stream]] or share < STANDING
                 gaps.flowing[row, own] = share if stands else 1.0
+                seen = alone[junction] and gaps.beside[row, own] and gaps.waiting[row, own] > 0
+                gaps.to_come[row, own] = share if seen else 1.0
 
 
 @compiled
@@ -246,22 +259,27 @@ def headways(come_veh: float) -> float:
 
 @compiled
 def clear(
-    row: int, veh: Floats, most: Floats, going: Ints, gaps: Gaps, pace: Floats, amid: Floats
+    row: int, veh: Floats, most: Floats, going: Ints, gaps: Gaps, pace: Floats, to_come: Floats, amid: Floats
 ) -> None:  # fmt: skip
-    """Takes from the vehicles `veh` (n,) those who wait for gaps as a green ends, and puts them into `amid` (n,)."""
+    """Takes from the vehicles `veh` (n,) those who wait for gaps as a green ends, and puts them into `amid` (n,).
+
+    On lanes on which nobody waited as the green was seen, a share `to_come` (n,) of all; see `begin_green`.
+    """
     place = 0
     while going[row, place] >= 0:
         stream = going[row, place]
         amid[stream] = 0.0
         if gaps.waiting[row, stream] > 0:
-            amid[stream] = min(gaps.amid_veh[row, stream] * (1 - pace[stream]) * most[stream], veh[stream])
+            wait = max(to_come[stream] - pace[stream], 0.0)
+            amid[stream] = min(gaps.amid_veh[row, stream] * wait * most[stream], veh[stream])
             veh[stream] -= amid[stream]
         place += 1
 
 
 @inlined
-def begin_green(row: int, gaps: Gaps, is_shown: bool, pace: Floats, free: Floats) -> None:
-    """Sets `pace` and `free` (n,) of `let_go` for a green that begins, or that is shown already and goes on."""
-    pace[:], free[:] = 1.0, 1.0
+def begin_green(row: int, gaps: Gaps, is_shown: bool, pace: Floats, free: Floats, to_come: Floats) -> None:
+    """Sets `pace`, `free` and `to_come` (n,) of `let_go` and `clear` for a green that begins, or that goes on."""
+    pace[:], free[:], to_come[:] = 1.0, 1.0, 1.0
     if is_shown:
         pace[:] = free[:] = gaps.flowing[row, : len(free)]
+        to_come[:] = gaps.to_come[row, : len(free)]

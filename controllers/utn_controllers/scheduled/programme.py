@@ -147,7 +147,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
     after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     others, veh = np.empty(stages, np.int64), np.empty(streams)
-    pace, free, want, amid = np.ones((4, streams))
+    pace, free, want, to_come, amid = np.ones((5, streams))
     stood, left = np.empty((2, stages + 1))
     for begin in range(bins):
         for stage in range(stages):
@@ -171,7 +171,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
             may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
             now, goes = begin, True
             if gaps is not None:
-                begin_green(row, gaps, begin == 0, pace, free)
+                begin_green(row, gaps, begin == 0, pace, free, to_come)
             while now < bins:
                 if spent + _held(stage, grown, paid, now, min(now + lose, bins), held) >= best - ALIKE:
                     break
@@ -181,7 +181,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                     won, won_in = 0.0, -1
                     stays = held + moving
                     if gaps is not None:
-                        clear(row, veh, most, going, gaps, pace, amid)
+                        clear(row, veh, most, going, gaps, pace, to_come, amid)
                         for place in range(greens):
                             stays -= worth[going[row, place]] * amid[going[row, place]]
                     for place in range(nexts):
@@ -434,16 +434,16 @@ def _send_off(
 @compiled
 def _let_all_go(plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats, most: Floats, sent: Floats) -> None:
     """Fills `sent` (n, K) as `_send_off` where somebody waits for gaps: bin by bin, from the vehicles `veh` (n,) on."""
-    pace, free, want, amid = np.ones((4, len(veh)))
+    pace, free, want, to_come, amid = np.ones((5, len(veh)))
     before = -1
     for place, row in enumerate(plan):
         sent[:, place] = veh + come[:, place]
         green = 0 <= row < len(gaps.some)
         if row != before:
             if 0 <= before < len(gaps.some):
-                clear(before, veh, most, rules.going, gaps, pace, amid)
+                clear(before, veh, most, rules.going, gaps, pace, to_come, amid)
             if green:
-                begin_green(row, gaps, place == 0, pace, free)
+                begin_green(row, gaps, place == 0, pace, free, to_come)
         for stream in range(len(veh)):
             share = rules.moves[row, stream] if row >= 0 else 0.0
             if not (green and share > 0):
