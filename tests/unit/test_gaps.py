@@ -143,7 +143,7 @@ def test_nobody_waits_for_gaps_on_lanes_from_which_hardly_anybody_turns(street_o
     streams = Streams(network)
     none = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=bool)
     held = np.zeros((len(streams.stage), int(np.diff(streams.first).max())), dtype=bool)
-    giving = Giving(network, streams, none, 2.0, held, np.ones(1, dtype=bool))
+    giving = Giving(network, streams, none, 2.0, held, np.array([4]))
     for share, waits in ((0.3, True), (0.02, True), (0.002, False)):
         of_set = streams.shares(network.fraction).way_of_set
         giving.take_up(np.where(of_set < 1, share, of_set))
@@ -157,15 +157,16 @@ def test_nobody_counts_as_gone_with_his_green_where_he_goes_on_while_who_walks_i
         assert (gaps.amid_veh[gaps.waiting > 0] == (0.0 if goes_on else AMID_VEH)).all()
 
 
-@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize(("cycle_lost_bins", "left_share"), [(8, 0.2), (7, 0.2), (7, 0.9)])
 def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
-    alone: bool, street_of: StreetOf
+    cycle_lost_bins: int, left_share: float, street_of: StreetOf
 ) -> None:
     network = street_of(odd_nets.two_lanes)
     streams, stages = Streams(network), network.junctions[0].stages
     learnt, held = (np.zeros((len(stages), count), dtype=bool) for count in (len(network.lane_sets), len(streams.link)))
-    giving = Giving(network, streams, learnt, 2.0, held, np.full(1, alone))
-    giving.take_up(streams.shares(network.fraction).way_of_set)
+    giving = Giving(network, streams, learnt, 2.0, held, np.array([cycle_lost_bins]))
+    of_set = streams.shares(network.fraction).way_of_set
+    giving.take_up(np.where(of_set < 1, left_share, of_set))
     rows, everywhere = np.argsort(streams.stage), np.ones(1, dtype=bool)
     waiting, seen = by_the_line(np.full(len(network.lane_sets), 5.0)), []
     stands = int(streams.lane_set[np.flatnonzero(giving.gaps.waiting[rows[stages[0]]] > 0)[0]])
@@ -178,9 +179,10 @@ def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
         shown = giving.gaps.flowing[rows[stage], : len(streams.link)]
         assert (shown[streams.lane_set != stands] == 1).all()
         seen.append(float(shown[streams.lane_set == stands][0]))
-        # Who waits there has left it: nobody more goes as this green ends.
+        # Who waits there has left it: nobody more goes as this green ends, where that counts.
         to_come, waits = giving.gaps.to_come[rows[stage]], giving.gaps.waiting[rows[stage]] > 0
-        assert (to_come == np.where(waits & alone, shown, 1)).all()
+        counts = waits & (cycle_lost_bins >= 4 * len(stages) or left_share > 0.75)
+        assert (to_come == np.where(counts, shown, 1)).all()
     assert seen[:3] == [1.0, 1.0, 1.0]
     assert seen[14] < 0.1
     assert seen[16:18] == [1.0, 1.0]

@@ -8,8 +8,8 @@ Who waits does so amid the junction, and clears it when the green ends, and who 
 nobody finds a gap, that is all who go (the Highway Capacity Manual's sneakers), and the more greens the more.
 
 Who waits amid the junction has left his lane already, and who is behind him will not go in this green: where a lane is
-seen to stand, nobody of it goes as the present green ends. Only junctions by themselves go by that: a street of several
-with short clearances had 1.03 times the delay.
+seen to stand, nobody of it goes as the present green ends. Schedules go by that where clearances are long, or most of a
+lane waits. Elsewhere green that ends sooner than that costs little, and who waits amid the junction waits no longer.
 
 With other lanes beside it that average will not do: a lane goes until the first who waits comes to its front, then it
 stands while the others go, and a green that is kept for what it would let go on average is kept for long. Which lanes
@@ -52,6 +52,10 @@ SOME_VEH = 1e-3
 """With fewer than so many nobody waits for one."""
 SOME_SHARE = 0.01
 """Of a lane's traffic: fewer who would wait for gaps are none."""
+LONG_BINS = 4
+"""Clearances of 7 s and more are long."""
+MOST_SHARE = 0.75
+"""Of a lane's traffic is most of it."""
 AMID_VEH = 1.0
 """Of a lane on which somebody waits, as its green ends, as in the Highway Capacity Manual: of the two that it counts
 one has found a gap, as a rule."""
@@ -83,10 +87,10 @@ class Gaps(NamedTuple):
 class Giving:
     """Keeps which share of each lane set waits for gaps."""
 
-    def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, held: Bools, alone: Bools):
+    def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, held: Bools, lost_bins: Ints):
         """But for lane sets whose discharge in a stage is `learnt` (S, L). Who is `held`, as in Moves, goes on.
 
-        Junctions are `alone` (J,) as of `are_alone`.
+        Of `lost_bins` (J,) the clearances of a cycle take.
         """
         self._streams = streams
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
@@ -120,7 +124,9 @@ class Giving:
                 found = sorted(foes.get((row, int(streams.lane_set[stream])), ()))
                 self.gaps.foes[row, stream - first, : len(found)] = np.array(found, dtype=np.int64) - first
                 self.gaps.beside[row, stream - first] = sets_of_link[streams.link[stream]] > 1
-        self._network, self._alone = network, alone
+        self._network = network
+        self._long = lost_bins >= LONG_BINS * np.diff(streams.first_stage)
+        """(J,) whether clearances are long, on average."""
         self._flowing = np.ones(len(network.lane_sets))
         """(L,) share of its discharge that each lane set has had of late in the green that it has."""
         self._queued = np.zeros(len(network.lane_sets), dtype=np.bool_)
@@ -140,7 +146,7 @@ class Giving:
             network, streams = self._network, self._streams
             _see(
                 view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0], view.x_veh >= self._full_veh,
-                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._alone, self._flowing,
+                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._long, self._flowing,
                 self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.next_link, streams.first,
                 self.gaps,
             )  # fmt: skip
@@ -176,7 +182,7 @@ def _foes(network: Network, streams: Streams, row: int, stage: int, way: int) ->
 @compiled
 def _see(
     time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, full: Bools,
-    flow: Floats, set_junction: Ints, alone: Bools, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats,
+    flow: Floats, set_junction: Ints, long: Bools, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats,
     stream_set: Ints, next_link: Ints, first: Ints, gaps: Gaps,
 ) -> None:  # fmt: skip
     behind = np.zeros(len(flowing), np.bool_)
@@ -202,8 +208,8 @@ def _see(
                 own, share = stream - first[junction], flowing[stream_set[stream]]
                 stands = gaps.waiting[row, own] > 0 or behind[stream_set[stream]] or share < STANDING
                 gaps.flowing[row, own] = share if stands else 1.0
-                seen = alone[junction] and gaps.beside[row, own] and gaps.waiting[row, own] > 0
-                gaps.to_come[row, own] = share if seen else 1.0
+                counts = gaps.waiting[row, own] > 0 and (long[junction] or gaps.waiting[row, own] >= MOST_SHARE)
+                gaps.to_come[row, own] = share if counts and gaps.beside[row, own] else 1.0
 
 
 @compiled
