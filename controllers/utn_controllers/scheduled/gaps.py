@@ -4,16 +4,16 @@ How long he waits for one is Adams' (1936) for Poisson traffic in which a gap mu
 come, so that a green is worth most when it has lasted. Behind who waits stand all on his lane: it goes by as much
 faster as fewer of it wait.
 
-Who waits does so amid the junction, and clears it when the green ends, and who is behind him with the yellow: where
-nobody finds a gap, that is all who go (the Highway Capacity Manual's sneakers), and the more greens the more.
-
-Who waits amid the junction has left his lane already, and who is behind him will not go in this green: where a lane is
-seen to stand, nobody of it goes as the present green ends. Schedules go by that where clearances are long, or most of a
-lane waits. Elsewhere green that ends sooner than that costs little, and who waits amid the junction waits no longer.
+Who waits does so amid the junction, and clears it when the green ends: where nobody finds a gap, that is all who go
+(the Highway Capacity Manual's sneakers), and the more greens the more.
 
 With other lanes beside it that average will not do: a lane goes until the first who waits comes to its front, then it
 stands while the others go, and a green that is kept for what it would let go on average is kept for long. Which lanes
 stand in the present green is seen by who has left them.
+
+Who waits amid the junction is one of these, and who is behind him will not go in this green: where a lane is seen to
+stand, nobody more of it goes as the green ends. Schedules go by that where clearances are long or most of a lane waits.
+Elsewhere a green that ends the sooner costs little, and who waits amid the junction waits the less.
 
 So it is behind a short road that is full, as between the two signals of a dual carriageway: who would go onto it stands
 in the way of his lane, and it empties in the next green, so that what can't go in this one may go in the one after.
