@@ -11,12 +11,12 @@ With other lanes beside it that average will not do: a lane goes until the first
 stands while the others go, and a green that is kept for what it would let go on average is kept for long. Which lanes
 stand in the present green is seen by who has left them.
 
-Who waits amid the junction is one of these, and who is behind him will not go in this green: where a lane is seen to
-stand, nobody more of it goes as the green ends. Schedules go by that where clearances are long or most of a lane waits.
-Elsewhere a green that ends the sooner costs little, and who waits amid the junction waits the less.
-
 So it is behind a short road that is full, as between the two signals of a dual carriageway: who would go onto it stands
 in the way of his lane, and it empties in the next green, so that what can't go in this one may go in the one after.
+
+Who waits amid the junction has left his lane, and who is behind him will not go in this green: where a lane is seen to
+stand for a gap, nobody more of it goes as the green ends. Schedules go by that where clearances are long or most of a
+lane waits. Elsewhere it was found to do harm: a green that ends the sooner costs little there.
 
 Where another stage of the junction has a lane set to itself, yielding.py has learnt what it does.
 """
