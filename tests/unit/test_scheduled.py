@@ -975,10 +975,11 @@ class TestExecution:
         assert blocking or set(chosen) == {view.stage[junction]}
 
     @pytest.mark.parametrize("hemmed", ["8", "9"])
-    @pytest.mark.parametrize("amid", [False, True])
+    @pytest.mark.parametrize(("amid", "taken"), [(False, 1.0), (True, 1.0), (True, 0.3), (True, 0.15)])
     def test_a_queue_that_reaches_back_onto_roads_unseen_goes_first(
-        self, hemmed: str, amid: bool, utn17: Network
+        self, hemmed: str, amid: bool, taken: float, utn17: Network
     ) -> None:
+        reaches = amid and taken > 0.2
         name = [link.id for link in utn17.links]
         links = tuple(replace(link, begins_amid=amid and link.id == hemmed) for link in utn17.links)
         queued = [name.index("8"), name.index("9")]
@@ -990,7 +991,7 @@ class TestExecution:
             view = replace(
                 scene(utn17, now_s),
                 set_zone_veh=by_the_line(near_veh),
-                x_veh=full * utn17.storage_veh,
+                x_veh=full * taken * utn17.storage_veh,
                 left_veh=np.full(len(utn17.groups), now_s),
             )
             wish = int(execution.wish(view)[junction])
@@ -1002,8 +1003,8 @@ class TestExecution:
             for stage in utn17.junctions[junction].stages
             if utn17.serves[stage, utn17.turn_link == name.index(hemmed)].any()
         )
-        assert chosen == ({shown, first} if amid else {shown})
-        assert wish == (first if amid else shown)
+        assert chosen == ({shown, first} if reaches else {shown})
+        assert wish == (first if reaches else shown)
 
     @pytest.mark.parametrize("starving", [0.0, 2.0])
     def test_who_has_waited_behind_a_queue_that_never_ends_is_let_go_some_time(

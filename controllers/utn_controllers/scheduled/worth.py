@@ -25,6 +25,9 @@ LASTING_S = 100.0
 """Over what time queues are taken that hold up those behind them, and full links: within a cycle all come and go."""
 DENSE = 0.3
 """Share of the room in sight from which on, over that time, a queue holds up who is behind it."""
+REACHING = 0.2, 0.4
+"""Shares of its storage between which the queue on a link that begins amid the net comes to hold up those behind it
+whom nobody sees. Who moves takes more room than who stands: it is at its beginning long before the link is full."""
 STARVED_S = 120.0
 """Who has not been let go to the last one for so long weighs more by all of `starving`, before that by the square of
 his share of it: most queues are gone within half of that time, and those are no matter."""
@@ -147,8 +150,11 @@ def _worth(
     starving: float, full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
     queue, taken = _lasts(dense), x / storage
-    # Where nobody sees who waits behind a link, its own vehicles say it.
-    feeding, behind = amid.astype(np.float64), amid * _lasts(np.minimum(taken, 1.0))
+    feeding, behind = amid.astype(np.float64), np.zeros(len(x))
+    for link in range(len(x)):
+        # Where nobody sees who waits behind a link, its own vehicles say it.
+        if amid[link]:
+            behind[link] = between(taken[link], REACHING)
     for stream, ahead in enumerate(next_links):
         if ahead != EXIT:
             feeding[ahead] += of_link[stream]
