@@ -4,7 +4,7 @@
 
 Counts are in veh, times in s, lengths in m, rates in veh/s unless a name says otherwise. Index
 spaces: Z links, M turns (one per link and next link or exit), G lane groups, L lane sets, S stages, J junctions, C
-callers, Kp and Kc horizons.
+callers, R side roads, Kp and Kc horizons.
 """
 
 from __future__ import annotations
@@ -173,6 +173,18 @@ class Junction:
 
 
 @dataclass(frozen=True)
+class SideRoad:
+    """A road without signals that waits for gaps in what signals let onto the road that it meets."""
+
+    edge: str
+    """SUMO edge that ends there."""
+    via_lanes: tuple[str, ...]
+    """SUMO lanes inside the node over which it is left."""
+    behind: tuple[tuple[int, str, float], ...]
+    """(junction, edge that its traffic goes on to, seconds of free driving from there to where the side road ends)."""
+
+
+@dataclass(frozen=True)
 class HeldGreen:
     """A part of a clearance in which some turns are green."""
 
@@ -210,6 +222,8 @@ class Network:
     """How fast queues of those who will drive speed up (`Traffic.acceleration_m_s2`); a car's where nobody says."""
     left_alone: Mapping[str, str] = field(default_factory=dict)
     """Signals that are none of the junctions, and why: they keep the net's own programme."""
+    side_roads: tuple[SideRoad, ...] = ()
+    """In the order of their edges."""
 
     @cached_property
     def turn_link(self) -> Ints:
@@ -735,6 +749,11 @@ class View(Protocol):
     @property
     def calling(self) -> Floats:
         """(C,) of each caller how many of its buttons are pressed, and on how many of its lanes somebody is close."""
+        ...
+
+    @property
+    def side_veh(self) -> tuple[Floats, Floats]:
+        """(R,) vehicles that stand at the end of each side road, (R,) that have left it since the run began."""
         ...
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:

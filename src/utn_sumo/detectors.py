@@ -9,7 +9,7 @@ turns apart. All report once a control step, which is when they are read: interv
 
 Where an execution decides within the control step, more lane-area detectors cut the same 200 m into zones, and some see
 who waits amid a junction because their green gives way to others, or behind these, or who is amid it late where people
-walk, or bicycles and trams on lanes of their own.
+walk, or bicycles and trams on lanes of their own, or who waits at the end of a side road; loops count who leaves that.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from utn_sumo.clearances import GIVES_WAY
-from utn_sumo.contract import CLOSE_ZONES, ZONES_M, Floats, LaneSet, Link, Measurement, Network, Turn
+from utn_sumo.contract import AREA_REACH_M, CLOSE_ZONES, ZONES_M, Floats, LaneSet, Link, Measurement, Network, Turn
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -75,6 +75,9 @@ class DetectorIds:
     """(M,) of the lane-area detectors amid junctions those on which each turn may wait, else none."""
     calling: tuple[tuple[str, ...], ...]
     """(C,) of the lane-area detectors those on the lanes of each caller."""
+    side_area: tuple[tuple[str, ...], ...]
+    side_line: tuple[tuple[str, ...], ...]
+    """(R,) the lane-area detectors at the end of each side road, and the loops behind it."""
 
 
 def ids(network: Network) -> DetectorIds:
@@ -132,6 +135,8 @@ def ids(network: Network) -> DetectorIds:
         upstream_zone=tuple(in_zones(index, before(link)) for index, link in enumerate(network.links)),
         amid=tuple(tuple(_named("amid", lane) for lane in lanes) for lanes in _amid(network)),
         calling=tuple(tuple(_named("call", lane) for lane in caller.lanes) for _, caller in network.callers),
+        side_area=tuple(on("wait", side.edge) for side in network.side_roads),
+        side_line=tuple(tuple(_named("side", lane) for lane in side.via_lanes) for side in network.side_roads),
     )
 
 
@@ -176,24 +181,25 @@ def _zones(network: Network, link: Link) -> list[tuple[str, int, float, float]]:
     return pieces
 
 
-def _loops(network: Network) -> Iterator[tuple[str, str, float]]:
+def _loops(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, float]]:
     """(kind, lane, metres from its begin, or to its end below 0) of the loops."""
     for link in network.links:
         for kind, edge, position_m in (("entry", link.edges[0], ENTRY_M), ("stop", link.edges[-1], STOP_LINE_M)):
             for lane in network.edge_lanes[edge]:
                 yield kind, f"{edge}_{lane}", position_m
     turning = [via for turn in network.turns for via in turn.via_lanes]
-    # One link's traffic may part onto another's: one loop then counts for both.
-    beside = sorted({via for link in network.links for via in (*link.joining, *link.parting)})
-    for kind, lanes in (("turn", turning), ("side", beside)):
+    # One link's traffic may part onto another's: one loop then counts for both. So it does for links and side roads.
+    beside = {via for link in network.links for via in (*link.joining, *link.parting)}
+    beside |= {via for side in network.side_roads for via in side.via_lanes if within_step}
+    for kind, lanes in (("turn", turning), ("side", sorted(beside))):
         for via in lanes:
             yield kind, via, TURN_M
 
 
 def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, float, float]]:
     """(kind, lane, metres from its begin, to) of the lane-area detectors."""
+    length_m = network.edge_length_m
     for link in network.links:
-        length_m = network.edge_length_m
         pieces = [("area", edge, length_m[edge] - seen_m, length_m[edge]) for edge, seen_m in network.watched(link)]
         for edge, zone, from_m, to_m in _zones(network, link) if within_step else ():
             # Less of a zone than that on an edge begins before the zone does.
@@ -209,6 +215,10 @@ def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, f
         yield "amid", via, 0.0, NEARLY_M
     for own in sorted({own for _, caller in network.callers for own in caller.lanes}) if within_step else ():
         yield "call", own, -CALLING_M, NEARLY_M
+    for side in network.side_roads if within_step else ():
+        end_m = length_m[side.edge]
+        for lane in network.edge_lanes[side.edge]:
+            yield "wait", f"{side.edge}_{lane}", max(end_m - AREA_REACH_M, 0.0), end_m
 
 
 def write(network: Network, path: Path, period_s: float, *, within_step: bool = False) -> None:
@@ -218,7 +228,7 @@ def write(network: Network, path: Path, period_s: float, *, within_step: bool = 
     """
     root = ET.Element("additional")
     report = {"period": f"{period_s:g}", "file": "NUL", "friendlyPos": "true"}
-    for kind, lane, position_m in _loops(network):
+    for kind, lane, position_m in _loops(network, within_step=within_step):
         place = {"lane": lane, "pos": f"{position_m:g}"}
         ET.SubElement(root, "inductionLoop", {"id": _named(kind, lane), **place, **report})
     for kind, lane, from_m, to_m in _areas(network, within_step=within_step):

@@ -71,7 +71,7 @@ class Turns(Keeps):
 
 class Scribbles(Turns):
     def taken(self, view):
-        for seen in (view.set_waiting_veh, view.waiting_veh, view.near_veh, view.calling):
+        for seen in (view.set_waiting_veh, view.waiting_veh, view.near_veh, view.calling, *view.side_veh):
             seen[:] = 0
         for seen in (view.x_veh, view.entered_veh, view.left_veh):
             seen[:] = 1000
@@ -404,7 +404,7 @@ def test_zones_cover_what_the_detectors_see_and_nothing_twice(make: Callable[[Pa
     areas: dict[str, list[tuple[float, float]]] = {}
     zones: dict[str, list[tuple[float, float]]] = {}
     for element in ET.parse(tmp_path / "detectors.add.xml").getroot().iter("laneAreaDetector"):
-        if element.attrib["id"].startswith(("utn_amid", "utn_call")):
+        if element.attrib["id"].startswith(("utn_amid", "utn_call", "utn_wait")):
             continue
         kind = zones if "_zone" in element.attrib["id"] else areas
         kind.setdefault(element.attrib["lane"], []).append(
@@ -420,3 +420,44 @@ def test_zones_cover_what_the_detectors_see_and_nothing_twice(make: Callable[[Pa
         assert pieces[0][0] == pytest.approx(begin_m, abs=0.01)
         assert end_m - CAR_M - 0.01 <= pieces[-1][1] <= end_m
         assert all(before[1] <= after[0] for before, after in pairwise(pieces))
+
+
+ASIDE = """
+import libsumo
+import numpy as np
+
+class Aside:
+    every_s = 2
+    def __init__(self, network, path):
+        self.network, self.path = network, path
+    def begin(self, plan, state):
+        pass
+    def wish(self, view):
+        stand, left = view.side_veh
+        edges = [side.edge for side in self.network.side_roads]
+        true = [libsumo.edge.getLastStepHaltingNumber(edge) for edge in edges]
+        with open(self.path, "a", encoding="utf-8") as file:
+            print(*left, *stand, *true, file=file)
+        return view.stage
+"""
+
+
+def test_who_stands_on_side_roads_is_seen_and_who_leaves_them_is_counted_on_over_control_steps(tmp_path: Path) -> None:
+    own, seen = tmp_path / "aside.py", tmp_path / "seen.txt"
+    own.write_text(ASIDE, encoding="utf-8")
+    chosen = scenario(
+        net=str(odd_nets.side_streets(tmp_path)),
+        controller="fixed",
+        execution=f"{own}:Aside",
+        settings={"execution": {"path": str(seen)}},
+    )
+    assert bridge.run(chosen, tmp_path / "run")["fallbacks"] == 0
+    left, stand, true = np.split(np.loadtxt(seen), 3, axis=1)
+    # Who is on a loop as a control step begins is counted again in the new one, and in the old one no more.
+    assert (np.diff(left, axis=0) >= -1).all()
+    # One every 15 s and one every 30 s for 240 s; all have gone by 300 s. Steps of control are a minute.
+    assert left[-1].tolist() == [16, 8]
+    # Who is slow, but does not stand by SUMO's edges, may stand by its detectors.
+    assert true.max() > 0
+    assert (stand >= true - 1).all()
+    assert (stand[true > 0] > 0).mean() > 0.9

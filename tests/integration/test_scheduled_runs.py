@@ -321,6 +321,36 @@ def test_left_turns_that_only_go_as_their_green_ends_have_greens_enough(tmp_path
     assert delay["recommended"] < delay["max_pressure"]
 
 
+def driveways(folder: Path) -> Path:
+    """Amid the main road between two signals people want to enter it from both sides, to either side."""
+    drawn = odd_nets.row("AB", gap_m=240).without("A-B", "B-A", "W-A", "A-W", "E-B", "B-E")
+    drawn.node("d", 120, 0)
+    for start, end in (("W", "A"), ("A", "d"), ("d", "B"), ("B", "E")):
+        drawn.road(start, end, 2, priority=5)
+    for name, y in (("nd", 120), ("sd", -120)):
+        drawn.node(name, 120, y)
+        drawn.road(name, "d", priority=1, speed=8.3)
+    drawn.net(folder, odd_nets.NO_TURNAROUNDS)
+    ways = [("W-A", "B-E", 750), ("E-B", "A-W", 750), ("W-A", "d-nd", 100), ("E-B", "d-sd", 100)]
+    ways += [("nd-d", "A-W", 130), ("nd-d", "B-E", 80), ("sd-d", "B-E", 130), ("sd-d", "A-W", 80)]
+    for name in "AB":
+        ways += [(f"{a}{name}-{name}", f"{name}-{b}{name}", 110) for a, b in ("ns", "sn")]
+        ways += [(f"n{name}-{name}", "B-E", 50), (f"s{name}-{name}", "A-W", 50)]
+    flows = "".join(
+        f'<flow id="{place}" begin="0" end="1500" period="exp({rate / 3600:.6f})" departLane="best" '
+        f'departSpeed="max" from="{start}" to="{end}"/>'
+        for place, (start, end, rate) in enumerate(ways)
+    )
+    return odd_nets.case(folder, flows, end="1800")
+
+
+def test_whoever_waits_to_enter_a_main_road_between_two_signals_is_left_gaps(tmp_path: Path) -> None:
+    file = str(driveways(tmp_path))
+    delay = delays_s(file, ("actuated", "delay_based", "recommended"), tmp_path)
+    # Where no schedule reckoned with him it was behind both: he found no gaps in what short greens let go.
+    assert delay["recommended"] < min(delay["actuated"], delay["delay_based"])
+
+
 def test_a_dual_carriageway_does_not_lock_at_the_three_car_lengths_between_its_sides(tmp_path: Path) -> None:
     # One signal for both sides, 30 m apart; who turns left off a side waits between them, and stops a lane behind him.
     streets = odd_nets.Streets()

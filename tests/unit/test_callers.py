@@ -14,6 +14,7 @@ from tests.unit.views import allowed, scene
 from utn_controllers.actuated import Actuated
 from utn_controllers.scheduled.calling import Calling
 from utn_controllers.scheduled.execution import Scheduled
+from utn_controllers.scheduled.sides import Sides
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo import callers
 from utn_sumo.contract import Execution, Network, Plan
@@ -117,11 +118,14 @@ def test_a_main_road_in_full_flow_is_not_stopped_for_one_who_has_just_pressed_a_
     assert Scheduled(network).wish(busy).tolist() == [first]
 
 
-@pytest.mark.parametrize("make", [odd_nets.pedestrians, odd_nets.tram_stage, odd_nets.crossing_amid_a_street])
+@pytest.mark.parametrize(
+    "make", [odd_nets.pedestrians, odd_nets.tram_stage, odd_nets.crossing_amid_a_street, odd_nets.side_streets]
+)
 def test_streams_of_motor_traffic_keep_their_places_and_their_greens(street_of: StreetOf, make: Make) -> None:
     network = street_of(make)
     streams = Streams(network)
-    calling = Calling(network, streams)
+    sides = Sides(network, streams, 2)
+    calling = Calling(network, streams, sides)
     own = streams.first[1:] - streams.first[:-1]
     for junction, (first, last) in enumerate(zip(calling.first[:-1], calling.first[1:], strict=True)):
         motors = np.arange(streams.first[junction], streams.first[junction + 1])
@@ -133,7 +137,8 @@ def test_streams_of_motor_traffic_keep_their_places_and_their_greens(street_of: 
     rng = np.random.default_rng(1)
     stand, worth, ends, most = rng.random((4, len(streams.link)))
     come, pressed = rng.random((len(streams.link), 5)), rng.integers(0, 3, len(network.callers)).astype(float)
-    joined = calling.join(pressed, np.full(len(network.junctions), 5.0), stand, come, worth, ends, most)
+    waiting = rng.random(len(sides))
+    joined = calling.join(pressed, waiting, np.full(len(network.junctions), 5.0), stand, come, worth, ends, most)
     for whole, part in zip(joined, (stand, come, worth, ends, most), strict=True):
         assert (whole[calling.motors] == part).all()
-    assert joined[0].sum() == pytest.approx(stand.sum() + pressed.sum())
+    assert joined[0].sum() == pytest.approx(stand.sum() + pressed.sum() + waiting.sum())

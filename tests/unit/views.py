@@ -31,6 +31,7 @@ class Scene:
     set_junction: Ints
     link_junction: Ints
     calling: Floats
+    side_veh: tuple[Floats, Floats]
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
         return (
@@ -81,6 +82,7 @@ def scene(
         network.link_junction[network.set_link],
         network.link_junction,
         np.zeros(len(network.callers)),
+        (np.zeros(len(network.side_roads)), np.zeros(len(network.side_roads))),
     )
 
 

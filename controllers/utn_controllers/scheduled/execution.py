@@ -15,6 +15,7 @@ from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.parked import Parked
 from utn_controllers.scheduled.programme import schedules
+from utn_controllers.scheduled.sides import Sides
 from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.worth import Worth
@@ -64,7 +65,8 @@ class Scheduled:
         self.settings = ScheduledSettings(**settings)  # type: ignore[arg-type]
         self.every_s = BIN_S
         self._streams = Streams(network)
-        self._calling = Calling(network, self._streams)
+        self._sides = Sides(network, self._streams, BIN_S)
+        self._calling = Calling(network, self._streams, self._sides)
         alone = are_alone(network, self._streams)
         moves = Moves(network, self._calling, BIN_S, alone)
         lost_bins = lost(self._streams.first_stage, moves.bins)
@@ -144,12 +146,13 @@ class Scheduled:
             rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
             rest = np.clip(rest_s / BIN_S, 0, self._plan.shape[1]).astype(np.int64)
         ends = self._ending.weights(view.free, worth, stand, come)
+        waiting = self._sides.look(view, present)
         wish, then = schedules(
             view.stage,
             view.free,
             rest,
             self._rules,
-            *self._calling.join(view.calling, self._ending.staying_bins, stand, come, worth, ends, most),
+            *self._calling.join(view.calling, waiting, self._ending.staying_bins, stand, come, worth, ends, most),
             self._plan,
             self._sent_veh,
         )
@@ -183,8 +186,8 @@ class Scheduled:
         stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
         zones = np.zeros((len(self.network.lane_sets), len(ZONES_M))), np.zeros((len(none), len(ZONES_M)))
-        calling = np.zeros(len(self.network.callers))
-        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody, calling))
+        calling, beside = np.zeros(len(self.network.callers)), np.zeros(len(self.network.side_roads))
+        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody, calling, (beside, beside)))
 
     def _take_up(self) -> None:
         self._giving.take_up(self._outlook.shares.way_of_set)
@@ -214,6 +217,7 @@ class _Nobody:
     entered_veh: Floats
     left_veh: Floats
     calling: Floats
+    side_veh: tuple[Floats, Floats]
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:  # noqa: ARG002 - nobody is anywhere
         return self.zones

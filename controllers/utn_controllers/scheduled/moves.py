@@ -135,7 +135,7 @@ def _shares(phases: Phases, letters: list[tuple[int, ...]], bin_s: int) -> Float
     bins = max(int(len(states) / bin_s + 0.5), 1)
     # Short ones are rounded up: what they end with goes on.
     states = [*states, *states[-1:] * (bins * bin_s)][: bins * bin_s]
-    green = [[all(state[letter] in GREEN for letter in own) for own in letters] for state in states]
+    green = [[bool(own) and all(state[letter] in GREEN for letter in own) for own in letters] for state in states]
     if not green:
         return np.zeros((bins, len(letters)))
     return np.asarray(np.reshape(green, (bins, bin_s, len(letters))).mean(axis=1))

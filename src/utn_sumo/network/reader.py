@@ -19,6 +19,7 @@ from utn_sumo.network import programmes
 from utn_sumo.network.lanes import lane_groups, lane_sets
 from utn_sumo.network.programmes import MIN_GREEN_S, SHORT_GREEN_S, Block, Phase
 from utn_sumo.network.roads import Chain, Roads, for_motors, leads_on, motor_lanes, reserved_lanes, usual_weight
+from utn_sumo.network.sides import side_roads
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
 from utn_sumo.xml_files import opened, stem
@@ -211,7 +212,10 @@ class _Reader:
                     callers=signal.callers,
                 )
             )
-        edges = sorted({edge for link in links for edge in link.edges} | {turn.to_edge for turn in turns})
+        of_links = {edge for link in links for edge in link.edges}
+        fed_roads = {(links[turn.link].junction, turn.to_edge) for turn in turns}
+        sides = side_roads(self.net, fed_roads, of_links)
+        edges = sorted(of_links | {turn.to_edge for turn in turns} | {side.edge for side in sides})
         return Network(
             name,
             path,
@@ -227,6 +231,7 @@ class _Reader:
             shortest_m=self.shortest_m,
             acceleration_m_s2=self.acceleration_m_s2,
             left_alone=left_alone,
+            side_roads=sides,
         )
 
     def _link(self, chain: Chain, fed: bool) -> Link:

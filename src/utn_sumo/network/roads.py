@@ -87,16 +87,16 @@ class Roads:
         incoming = {other: for_motors(each) for other, each in edge.getIncoming().items()}
         if any(each.getTLSID() for connections in edge.getIncoming().values() for each in connections):
             return None
-        before = _main(incoming)
+        before = main_road(incoming)
         if before is None or before.getID() in self._approaches:
             return None
         outgoing = {other: for_motors(each) for other, each in before.getOutgoing().items()}
         sides = [each for other, connections in incoming.items() if other is not before for each in connections]
         sides += [each for other, connections in outgoing.items() if other is not edge for each in connections]
-        return before if _main(outgoing) is edge and all(each.getViaLaneID() for each in sides) else None
+        return before if main_road(outgoing) is edge and all(each.getViaLaneID() for each in sides) else None
 
 
-def _main(sides: Mapping[Any, list[Any]]) -> Any | None:
+def main_road(sides: Mapping[Any, list[Any]]) -> Any | None:
     """The main one of the roads that meet another at a node: straight on, then by lanes, then by the road's rank."""
     able = [(edge, connections) for edge, connections in sides.items() if usual_weight(connections) > RARE_LANES]
     if not able:

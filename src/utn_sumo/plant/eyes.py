@@ -47,6 +47,8 @@ class Eyes:
         )
         # Counted at the stop line: who changes lanes just there is missed now and then, but loops are half as many.
         self._exits = detectors([*ids.set_stop_line, *ids.parting], by_set)
+        at_sides = np.zeros(len(network.side_roads), dtype=np.int64)
+        self._side_areas, self._side_lines = detectors(ids.side_area, at_sides), detectors(ids.side_line, at_sides)
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
@@ -78,6 +80,8 @@ class Eyes:
         self._entered_veh = np.zeros(self._links)
         self._left_veh = np.zeros(self._sets)
         """(Z,) vehicles that had come onto each link by then, (L,) that had crossed each lane set's stop line."""
+        self._side_left_veh = np.zeros(len(network.side_roads))
+        """(R,) that had left each side road by then."""
         self._warm_up()
 
     def begin(self, time_s: float, x_veh: Floats) -> None:
@@ -86,16 +90,26 @@ class Eyes:
         if time_s > 0:
             self._entered_veh = self._entered_veh + self._entries.read(self._counted_last)
             self._left_veh = self._left_veh + self._exits.read(self._counted_last)[: self._sets]
+            self._side_left_veh = self._side_left_veh + self._side_lines.read(self._counted_last)
 
     @property
     def sumo_time_s(self) -> float:
         """Wall time so far inside SUMO's functions, in readings of many detectors at once."""
-        readers = (self._areas, self._zones, self._entries, self._exits, self._buttons)
+        readers = (
+            self._areas, self._zones, self._entries, self._exits, self._buttons, self._side_areas, self._side_lines
+        )  # fmt: skip
         return sum(reader.sumo_time_s for reader in readers)
 
     def calling(self) -> Floats:
         """(C,) of contract.View."""
         return self._buttons.read()
+
+    def side_veh(self, time_s: float) -> tuple[Floats, Floats]:
+        """(R,) and (R,) of contract.View."""
+        stand = self._side_areas.read(self._halting)
+        # Where a control step begins its counts have just been taken up, and SUMO's begin anew with the next second.
+        since = self._side_lines.read(self._counted) if time_s % self._step_s else 0.0
+        return stand, self._side_left_veh + since
 
     def standing_veh(self) -> Floats:
         """(L + Z,) standing in the lane-area detectors of lane sets, and of links before their lanes part."""
@@ -278,6 +292,11 @@ class Sight:
     def calling(self) -> Floats:
         """(C,) of each caller how many of its buttons are pressed, and on how many of its lanes somebody is close."""
         return self._eyes.calling()
+
+    @property
+    def side_veh(self) -> tuple[Floats, Floats]:
+        """(R,) vehicles that stand at the end of each side road, (R,) that have left it since the run began."""
+        return self._eyes.side_veh(self.time_s)
 
     @property
     def x_veh(self) -> Floats:
