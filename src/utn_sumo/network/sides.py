@@ -27,10 +27,14 @@ def side_roads(net: Any, fed: Iterable[tuple[int, str]], links: Collection[str])
             for side in waiting:
                 behind.setdefault(side, []).append((junction, to_edge, after_s))
     return tuple(
-        SideRoad(edge, tuple(sorted({each.getViaLaneID() for each in _connections(net.getEdge(edge))})), tuple(found))
+        SideRoad(edge, _via_lanes(net.getEdge(edge)), tuple(found))
         for edge, found in sorted(behind.items())
         if edge not in main
     )
+
+
+def _via_lanes(edge: Any) -> tuple[str, ...]:
+    return tuple(sorted({via for each in _connections(edge) if (via := each.getViaLaneID())}))
 
 
 def _along(edge: Any) -> Iterator[tuple[str, list[str], float]]:
