@@ -98,9 +98,9 @@ def _makes_gaps(network: Network, streams: Streams, junction: int, to_edge: str)
     """(S,) whether a stage lets few onto the edge."""
     own = network.junctions[junction]
     flow = {
-        index: turn.fraction * network.links[turn.link].lanes
-        for index, turn in enumerate(network.turns)
-        if turn.to_edge == to_edge and network.links[turn.link].junction == junction
+        turn: network.turns[turn].fraction * network.links[network.turns[turn].link].lanes
+        for turn in network.turns_of[junction].tolist()
+        if network.turns[turn].to_edge == to_edge
     }
     few = np.zeros(len(streams.stage), dtype=np.bool_)
     for row in range(*streams.first_stage[junction : junction + 2]):
