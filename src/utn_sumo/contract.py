@@ -751,16 +751,19 @@ class View(Protocol):
         """(C,) of each caller how many of its buttons are pressed, and on how many of its lanes somebody is close."""
         ...
 
-    @property
-    def side_veh(self) -> tuple[Floats, Floats]:
-        """(R,) vehicles that stand at the end of each side road, (R,) that have left it since the run began."""
-        ...
-
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
         """Vehicles before some junctions (J,) by how far they are from the stop line (`ZONES_M`), none elsewhere.
 
         (L, zones) on the lanes of each lane set, (Z, zones) on each link before its lanes part.
         """
+        ...
+
+    def side_standing_veh(self, roads: Bools) -> Floats:
+        """(R,) vehicles that stand at the end of some side roads (R,), none on others."""
+        ...
+
+    def side_left_veh(self, roads: Bools) -> Floats:
+        """(R,) vehicles that have left some side roads (R,) since the run began; what others have is of no meaning."""
         ...
 
     def close_one_veh(self, lane_set: int) -> float:

@@ -71,7 +71,7 @@ class Turns(Keeps):
 
 class Scribbles(Turns):
     def taken(self, view):
-        for seen in (view.set_waiting_veh, view.waiting_veh, view.near_veh, view.calling, *view.side_veh):
+        for seen in (view.set_waiting_veh, view.waiting_veh, view.near_veh, view.calling):
             seen[:] = 0
         for seen in (view.x_veh, view.entered_veh, view.left_veh):
             seen[:] = 1000
@@ -433,7 +433,8 @@ class Aside:
     def begin(self, plan, state):
         pass
     def wish(self, view):
-        stand, left = view.side_veh
+        every = np.ones(len(self.network.side_roads), dtype=bool)
+        stand, left = view.side_standing_veh(every), view.side_left_veh(every)
         edges = [side.edge for side in self.network.side_roads]
         true = [libsumo.edge.getLastStepHaltingNumber(edge) for edge in edges]
         with open(self.path, "a", encoding="utf-8") as file:

@@ -116,7 +116,7 @@ def went(network: Network, rate: Callable[[bool], float], bins: int = 600) -> tu
             then = max(time_bin - math.floor(after_s / BIN_S) - 1, 0)
             main = network.junctions[junction].stages[shown[then][junction] - first_row[junction]]
             left[road] += rng.poisson(rate(not serves_main(network, main)))
-        seen = replace(scene(network), side_veh=(np.full(len(left), 2.0), left.copy()))
+        seen = replace(scene(network), side_stand_veh=np.full(len(left), 2.0), side_gone_veh=left.copy())
         waiting = sides.look(seen, rows)
     return sides, waiting
 

@@ -31,13 +31,20 @@ class Scene:
     set_junction: Ints
     link_junction: Ints
     calling: Floats
-    side_veh: tuple[Floats, Floats]
+    side_stand_veh: Floats
+    side_gone_veh: Floats
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
         return (
             np.where(junctions[self.set_junction][:, None], self.set_zone_veh, 0.0),
             np.where(junctions[self.link_junction][:, None], self.link_zone_veh, 0.0),
         )
+
+    def side_standing_veh(self, roads: Bools) -> Floats:
+        return np.where(roads, self.side_stand_veh, 0.0)
+
+    def side_left_veh(self, roads: Bools) -> Floats:
+        return np.where(roads, self.side_gone_veh, np.nan)
 
     def close_one_veh(self, lane_set: int) -> float:
         before = self.link_zone_veh[self.set_link[lane_set]]
@@ -82,7 +89,8 @@ def scene(
         network.link_junction[network.set_link],
         network.link_junction,
         np.zeros(len(network.callers)),
-        (np.zeros(len(network.side_roads)), np.zeros(len(network.side_roads))),
+        np.zeros(len(network.side_roads)),
+        np.zeros(len(network.side_roads)),
     )
 
 

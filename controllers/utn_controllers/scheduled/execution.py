@@ -186,8 +186,8 @@ class Scheduled:
         stage = np.array([junction.stages[0] for junction in self.network.junctions], dtype=np.int64)
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
         zones = np.zeros((len(self.network.lane_sets), len(ZONES_M))), np.zeros((len(none), len(ZONES_M)))
-        calling, beside = np.zeros(len(self.network.callers)), np.zeros(len(self.network.side_roads))
-        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody, calling, (beside, beside)))
+        calling = np.zeros(len(self.network.callers))
+        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody, calling))
 
     def _take_up(self) -> None:
         self._giving.take_up(self._outlook.shares.way_of_set)
@@ -217,10 +217,15 @@ class _Nobody:
     entered_veh: Floats
     left_veh: Floats
     calling: Floats
-    side_veh: tuple[Floats, Floats]
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:  # noqa: ARG002 - nobody is anywhere
         return self.zones
+
+    def side_standing_veh(self, roads: Bools) -> Floats:
+        return np.zeros(len(roads))
+
+    def side_left_veh(self, roads: Bools) -> Floats:
+        return np.zeros(len(roads))
 
     def close_one_veh(self, lane_set: int) -> float:  # noqa: ARG002
         return 0.0

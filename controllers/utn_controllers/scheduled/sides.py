@@ -30,8 +30,9 @@ more for nothing else."""
 class Seen(Protocol):
     """What of a View is looked at here."""
 
-    @property
-    def side_veh(self) -> tuple[Floats, Floats]: ...
+    def side_standing_veh(self, roads: Bools) -> Floats: ...
+
+    def side_left_veh(self, roads: Bools) -> Floats: ...
 
 
 class Sides:
@@ -68,8 +69,12 @@ class Sides:
         """(P, 2) bins in which somebody waited, without gaps from the junction and with them."""
         self._gone = np.zeros((len(pairs), 2))
         """(P, 2) who went in these."""
+        self._own = np.isin(np.arange(len(network.side_roads)), self._road)
+        """(R,) side roads of which it depends on signals whether somebody waits."""
         self._before = np.zeros(len(network.side_roads)), np.zeros(len(network.side_roads))
-        """(R,) who stood a bin ago, and had left by then."""
+        """(R,) who stood a bin ago, and had left by then where anybody stood."""
+        # Have the machine code made now, not when somebody comes.
+        self._waiting(*self._before, self._before[0])
 
     def __len__(self) -> int:
         return len(self.junction)
@@ -78,13 +83,20 @@ class Sides:
         """(E,) vehicles that wait for gaps; `present` are the rows (J,) of the stages shown. A bin has gone by."""
         if not len(self):
             return np.zeros(0)
-        stand, left = view.side_veh
         self._shown = np.vstack([present, self._shown[:-1]])
         stood, had_left = self._before
+        stand = view.side_standing_veh(self._own)
+        asked = (stand > 0) | (stood > 0)
+        if not asked.any():
+            return np.zeros(len(self))
+        left = view.side_left_veh(asked)
         self._before = stand, left
+        return self._waiting(stand, stood, left - had_left)
+
+    def _waiting(self, stand: Floats, stood: Floats, gone: Floats) -> Floats:
         veh: Floats = _waiting(
-            stand, stood, left - had_left, self._shown, self.serves, self._stream, self._road, self._junction,
-            self._late, self._share, self._waited, self._gone, len(self),
+            stand, stood, gone, self._shown, self.serves, self._stream, self._road, self._junction, self._late,
+            self._share, self._waited, self._gone, len(self),
         )  # fmt: skip
         return veh
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from functools import cached_property, partial
-from itertools import chain, compress
+from itertools import chain, compress, pairwise
 from typing import Any
 
 import numpy as np
@@ -47,8 +47,10 @@ class Eyes:
         )
         # Counted at the stop line: who changes lanes just there is missed now and then, but loops are half as many.
         self._exits = detectors([*ids.set_stop_line, *ids.parting], by_set)
-        at_sides = np.zeros(len(network.side_roads), dtype=np.int64)
-        self._side_areas, self._side_lines = detectors(ids.side_area, at_sides), detectors(ids.side_line, at_sides)
+        sides = len(network.side_roads)
+        self._side_areas, self._side_lines = (
+            _Detectors(names, np.arange(sides), sides) for names in (ids.side_area, ids.side_line)
+        )
         self._group_areas = ids.group
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
@@ -80,7 +82,7 @@ class Eyes:
         self._entered_veh = np.zeros(self._links)
         self._left_veh = np.zeros(self._sets)
         """(Z,) vehicles that had come onto each link by then, (L,) that had crossed each lane set's stop line."""
-        self._side_left_veh = np.zeros(len(network.side_roads))
+        self._side_left_veh = np.zeros(sides)
         """(R,) that had left each side road by then."""
         self._warm_up()
 
@@ -104,12 +106,15 @@ class Eyes:
         """(C,) of contract.View."""
         return self._buttons.read()
 
-    def side_veh(self, time_s: float) -> tuple[Floats, Floats]:
-        """(R,) and (R,) of contract.View."""
-        stand = self._side_areas.read(self._halting)
+    def side_standing_veh(self, roads: Bools) -> Floats:
+        """(R,) of contract.View."""
+        return self._side_areas.read(self._halting, roads)
+
+    def side_left_veh(self, time_s: float, roads: Bools) -> Floats:
+        """(R,) of contract.View."""
         # Where a control step begins its counts have just been taken up, and SUMO's begin anew with the next second.
-        since = self._side_lines.read(self._counted) if time_s % self._step_s else 0.0
-        return stand, self._side_left_veh + since
+        since = self._side_lines.read(self._counted, roads) if time_s % self._step_s else 0.0
+        return np.asarray(self._side_left_veh + since)
 
     def standing_veh(self) -> Floats:
         """(L + Z,) standing in the lane-area detectors of lane sets, and of links before their lanes part."""
@@ -203,7 +208,7 @@ class _Detectors:
     """Detectors whose counts add up by place: by link, by lane group, or by zone of it."""
 
     def __init__(self, names: Sequence[Sequence[str]], junction: Ints, junctions: int):
-        """`names` of those at each place, before which `junction` of so many it is."""
+        """`names` of those at each place, before which `junction` of so many it is, or on which side road."""
         self._places = len(names)
         order = np.argsort(junction, kind="stable")
         counts = np.array([len(names[place]) for place in order], dtype=np.int64)
@@ -211,7 +216,7 @@ class _Detectors:
         self._names = list(chain.from_iterable(names[place] for place in order))
         self._junction = np.repeat(junction[order], counts)
         ends = np.cumsum(np.bincount(self._junction, minlength=junctions)).tolist()
-        self._of_junction = [self._names[begin:end] for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
+        self._of_junction = [self._names[begin:end] for begin, end in pairwise([0, *ends])]
         self._everywhere = np.ones(junctions, dtype=np.bool_)
         self.sumo_time_s = 0.0
 
@@ -267,6 +272,8 @@ class Sight:
         self.close_one_veh = eyes.close_one_veh
         self.gap_one_s = eyes.gap_one_s
         self.zone_veh = eyes.zone_veh
+        self.side_standing_veh = eyes.side_standing_veh
+        self.side_left_veh = partial(eyes.side_left_veh, time_s)
         self._eyes = eyes
 
     @property
@@ -292,11 +299,6 @@ class Sight:
     def calling(self) -> Floats:
         """(C,) of each caller how many of its buttons are pressed, and on how many of its lanes somebody is close."""
         return self._eyes.calling()
-
-    @property
-    def side_veh(self) -> tuple[Floats, Floats]:
-        """(R,) vehicles that stand at the end of each side road, (R,) that have left it since the run began."""
-        return self._eyes.side_veh(self.time_s)
 
     @property
     def x_veh(self) -> Floats:
