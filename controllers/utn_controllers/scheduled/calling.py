@@ -11,7 +11,8 @@ import numpy as np
 from utn_controllers.scheduled.sides import Sides
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.callers import served
-from utn_sumo.contract import Floats, Network
+from utn_sumo.compiling import compiled
+from utn_sumo.contract import Floats, Ints, Network
 
 PRESSED_VEH = 0.5
 """What a pressed button weighs, or a lane with somebody close to the stop line."""
@@ -48,11 +49,13 @@ class Calling:
         self.letters = [each[stream] for stream in order]
         """(A,) letters of its junction that each has green by; none of those that no signal stops."""
         where = np.argsort(order)
-        motors, self._called, self._beside = np.split(where, np.cumsum([len(of_motors), len(one)]))
-        """Places of the callers' streams, and of those on side roads."""
-        self.motors = motors if len(where) > len(motors) else slice(None)
+        self._places = np.split(where, np.cumsum([len(of_motors), len(one)]))
+        """Places of the streams of motor traffic, of the callers', and of those on side roads."""
+        self._is_joined = len(where) > len(of_motors)
+        self.motors = self._places[0] if self._is_joined else slice(None)
         """(N,) places of the streams of motor traffic."""
-        self._junction, self._sides = junctions[one], sides
+        self._junctions, self._most = (junctions[one], sides.junction), sides.most
+        """At which junction callers' streams are, and those on side roads; (E,) who go of these in a bin."""
 
     def join(
         self,
@@ -70,19 +73,33 @@ class Calling:
         And by how many buttons of each caller are pressed, `calling` (C,), and how many are `waiting` (E,) on side
         roads; who is left at the end of a schedule stays there for so many bins, `staying` (J,).
         """
-        if isinstance(self.motors, slice):
+        if not self._is_joined:
             return stand, come, worth, ends, most
-        pressed = np.bincount(self._stream, calling, len(self._called)).astype(np.float64)
-        left, sides = staying[self._junction], self._sides
-        return (
-            self._mixed(stand, pressed, waiting),
-            self._mixed(come, 0.0, 0.0),
-            self._mixed(worth, PRESSED_VEH, 1.0),
-            self._mixed(ends, PRESSED_VEH * left, staying[sides.junction]),
-            self._mixed(most, ALL, sides.most),
-        )
+        joined: tuple[Floats, Floats, Floats, Floats, Floats] = _joined(
+            *self._places, *self._junctions, self._stream, self._most, calling, waiting, staying,
+            stand, come, worth, ends, most,
+        )  # fmt: skip
+        return joined
 
-    def _mixed(self, of_motors: Floats, of_callers: Floats | float, of_sides: Floats | float) -> Floats:
-        each = np.empty((len(self.letters), *of_motors.shape[1:]))
-        each[self.motors], each[self._called], each[self._beside] = of_motors, of_callers, of_sides
-        return each
+
+@compiled
+def _joined(
+    motors: Ints, called: Ints, beside: Ints, called_at: Ints, beside_at: Ints, stream: Ints, beside_most: Floats,
+    calling: Floats, waiting: Floats, staying: Floats,
+    stand: Floats, come: Floats, worth: Floats, ends: Floats, most: Floats,
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:  # fmt: skip
+    every = len(motors) + len(called) + len(beside)
+    all_stand, all_worth, all_ends, all_most = np.zeros(every), np.zeros(every), np.zeros(every), np.zeros(every)
+    all_come = np.zeros((every, come.shape[1]))
+    for own, place in enumerate(motors):
+        all_stand[place], all_come[place] = stand[own], come[own]
+        all_worth[place], all_ends[place], all_most[place] = worth[own], ends[own], most[own]
+    for caller, pressed in enumerate(calling):
+        all_stand[called[stream[caller]]] += pressed
+    for own, place in enumerate(called):
+        all_worth[place], all_most[place] = PRESSED_VEH, ALL
+        all_ends[place] = PRESSED_VEH * staying[called_at[own]]
+    for own, place in enumerate(beside):
+        all_stand[place], all_worth[place], all_most[place] = waiting[own], 1.0, beside_most[own]
+        all_ends[place] = staying[beside_at[own]]
+    return all_stand, all_come, all_worth, all_ends, all_most

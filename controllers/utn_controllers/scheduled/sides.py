@@ -64,7 +64,9 @@ class Sides:
         self.most = np.bincount(self._stream, lanes[self._road], len(places)).astype(np.float64)
         """(E,) who go in a bin: one a lane."""
         self._shown = np.full((int(self._late.max(initial=0)) + 1, len(network.junctions)), -1)
-        """(bins, J) rows of the stages shown, the latest first, -1 before the run."""
+        """(bins, J) rows of the stages shown, -1 before the run; the latest takes the place of the oldest."""
+        self._now = 0
+        """Place of the latest."""
         self._waited = np.zeros((len(pairs), 2))
         """(P, 2) bins in which somebody waited, without gaps from the junction and with them."""
         self._gone = np.zeros((len(pairs), 2))
@@ -83,7 +85,8 @@ class Sides:
         """(E,) vehicles that wait for gaps; `present` are the rows (J,) of the stages shown. A bin has gone by."""
         if not len(self):
             return np.zeros(0)
-        self._shown = np.vstack([present, self._shown[:-1]])
+        self._now = (self._now + 1) % len(self._shown)
+        self._shown[self._now] = present
         stood, had_left = self._before
         stand = view.side_standing_veh(self._own)
         asked = (stand > 0) | (stood > 0)
@@ -95,8 +98,8 @@ class Sides:
 
     def _waiting(self, stand: Floats, stood: Floats, gone: Floats) -> Floats:
         veh: Floats = _waiting(
-            stand, stood, gone, self._shown, self.serves, self._stream, self._road, self._junction, self._late,
-            self._share, self._waited, self._gone, len(self),
+            stand, stood, gone, self._shown, self._now, self.serves, self._stream, self._road, self._junction,
+            self._late, self._share, self._waited, self._gone, len(self),
         )  # fmt: skip
         return veh
 
@@ -125,12 +128,12 @@ def _makes_gaps(network: Network, streams: Streams, junction: int, to_edge: str)
 
 @compiled
 def _waiting(
-    stand: Floats, stood: Floats, gone: Floats, shown: Ints, serves: Bools, stream: Ints, road: Ints, junction: Ints,
-    late: Ints, share: Floats, waited: Floats, went: Floats, streams: int,
+    stand: Floats, stood: Floats, gone: Floats, shown: Ints, now: int, serves: Bools, stream: Ints, road: Ints,
+    junction: Ints, late: Ints, share: Floats, waited: Floats, went: Floats, streams: int,
 ) -> Floats:  # fmt: skip
     veh = np.zeros(streams)
     for pair in range(len(stream)):
-        own, row = road[pair], shown[late[pair], junction[pair]]
+        own, row = road[pair], shown[now - late[pair], junction[pair]]
         if stood[own] > 0 and row >= 0:
             with_gaps = int(serves[row, stream[pair]])
             for kind in range(2):
