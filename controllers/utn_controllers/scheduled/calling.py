@@ -99,6 +99,7 @@ def _joined(
     for own, place in enumerate(called):
         all_worth[place], all_most[place] = PRESSED_VEH, ALL
         all_ends[place] = PRESSED_VEH * staying[called_at[own]]
+    # A side road's weigh as before an empty road: how full theirs is, nothing says.
     for own, place in enumerate(beside):
         all_stand[place], all_worth[place], all_most[place] = waiting[own], 1.0, beside_most[own]
         all_ends[place] = staying[beside_at[own]]
