@@ -35,6 +35,9 @@ ZONES_M = (22.0, 50.0, 85.0, 130.0, AREA_REACH_M)
 """How far from the stop line the zones end in which they say where vehicles are: the nearer the finer."""
 CLOSE_ZONES = 2
 """Who is in these, up to 50 m, is at the stop line within a few seconds."""
+WITHIN_VEH = 3.0
+"""Roads from one node of a junction to another that hold fewer vehicles a lane are within it: who waits there is in the
+way."""
 SAMPLE_S = 10.0
 """Longest time between two readings of the entry loops (the paper's sampling interval)."""
 LEAST_PAUSE_S = 1.0
@@ -275,6 +278,21 @@ class Network:
         for junction in self.junctions:
             free[[turn for turns in junction.signal_turns for turn in turns]] = False
         return free
+
+    @cached_property
+    def within(self) -> Bools:
+        """(Z,) links from one node to another of a junction, that hold fewer than WITHIN_VEH a lane.
+
+        Who has to wait at their end stands amid the junction, in the way of all behind him.
+        """
+        within = np.zeros(len(self.links), dtype=np.bool_)
+        for turn in self.turns:
+            if turn.next_link != EXIT:
+                ahead = self.links[turn.next_link]
+                room_veh = ahead.length_m / (ahead.queue_spacing_m * ahead.lanes)
+                is_one = ahead.junction == self.links[turn.link].junction
+                within[turn.next_link] |= is_one and room_veh < WITHIN_VEH
+        return within
 
     @cached_property
     def callers(self) -> tuple[tuple[int, Caller], ...]:
@@ -756,6 +774,10 @@ class View(Protocol):
 
         (L, zones) on the lanes of each lane set, (Z, zones) on each link before its lanes part.
         """
+        ...
+
+    def standing_amid_veh(self, turn: int) -> float:
+        """Vehicles of one turn onto a link within its junction (`Network.within`) that stand or creep amid it."""
         ...
 
     def side_standing_veh(self, roads: Bools) -> Floats:

@@ -23,7 +23,18 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from utn_sumo.clearances import GIVES_WAY
-from utn_sumo.contract import AREA_REACH_M, CLOSE_ZONES, ZONES_M, Floats, LaneSet, Link, Measurement, Network, Turn
+from utn_sumo.contract import (
+    AREA_REACH_M,
+    CLOSE_ZONES,
+    EXIT,
+    ZONES_M,
+    Floats,
+    LaneSet,
+    Link,
+    Measurement,
+    Network,
+    Turn,
+)
 
 ENTRY_M = 1.0
 """Entry loops stand this far into the first edge."""
@@ -143,7 +154,7 @@ def ids(network: Network) -> DetectorIds:
 def _amid(network: Network) -> list[tuple[str, ...]]:
     """(M,) lanes amid junctions on which each turn waits that gives way in some stage, or behind one that does.
 
-    All where people walk.
+    Or before a road within the junction. All where people walk.
     """
     waiting = {
         turn
@@ -152,6 +163,7 @@ def _amid(network: Network) -> list[tuple[str, ...]]:
         if junction.is_walked or any(network.stages[stage].state[letter] == GIVES_WAY for stage in junction.stages)
         for turn in turns
     }
+    waiting |= set(np.flatnonzero((network.turn_next != EXIT) & network.within[network.turn_next]).tolist())
     shared = {(network.turns[turn].link, lane) for turn in waiting for lane in network.turns[turn].from_lanes}
 
     def is_seen(index: int, turn: Turn) -> bool:

@@ -441,6 +441,32 @@ def joined(folder: Path) -> Path:
     return case(folder, traffic("AB"))
 
 
+def carriageways(folder: Path, apart_m: float = 14, left_veh_h: float = 110, end_s: int = 300) -> Path:
+    """A main road whose carriageways are apart and a street across it, under one programme: a road within the junction.
+
+    Who turns left off a carriageway waits amid the junction until the street has green.
+    """
+    streets = Streets()
+    for name, y in (("a", 0.0), ("b", apart_m)):
+        streets.node(name, 0, y, "traffic_light", tl="J")
+    for name, x, y in (("W", -1, 0), ("F", 1, 0), ("E", 1, apart_m), ("V", -1, apart_m)):
+        streets.node(name, x * ARM_M, y)
+    for start, end in (("W", "a"), ("a", "F"), ("E", "b"), ("b", "V")):
+        streets.one_way(start, end, 2)
+    for name, y in (("S", -ARM_M), ("N", apart_m + ARM_M)):
+        streets.node(name, 0, y)
+    for start, end in (("S", "a"), ("a", "b"), ("b", "N")):
+        streets.road(start, end)
+    streets.net(folder, NO_TURNAROUNDS)
+    ways = [("W-a", "a-F", 500), ("E-b", "b-V", 500), ("S-a", "b-N", 150), ("N-b", "a-S", 150)]
+    ways += [("W-a", "b-N", left_veh_h), ("E-b", "a-S", left_veh_h), ("S-a", "b-V", 30), ("N-b", "a-F", 30)]
+    flows = "".join(
+        flow(f"f{place}", start, end, end=end_s - 60, period=f"exp({rate / 3600:.5f})", departLane="best")
+        for place, (start, end, rate) in enumerate(ways)
+    )
+    return case(folder, flows, end=str(end_s))
+
+
 def actuated(folder: Path) -> Path:
     """SUMO's own gap-out actuation, with phases between minDur and maxDur."""
     options = ("--tls.default-type", "actuated", "--tls.min-dur", "6", "--tls.max-dur", "40")
@@ -922,6 +948,7 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     blinking_at_night,
     turning_pockets,
     side_streets,
+    carriageways,
     roundabout,
     dead_ends,
     left_hand,

@@ -463,3 +463,10 @@ def test_cars_parked_beside_a_quiet_road_do_not_call_for_its_green(tmp_path: Pat
         assert_safe(result)
         delays_s.append(result["mean_delay_s"])
     assert delays_s[1] < 1.2 * delays_s[0]
+
+
+def test_left_turns_between_two_carriageways_are_let_out_before_the_next_want_in(tmp_path: Path) -> None:
+    file = str(odd_nets.carriageways(tmp_path, left_veh_h=60, end_s=1500))
+    delay = delays_s(file, ("actuated", "delay_based", "recommended"), tmp_path)
+    # They stand where no road's detectors see them: schedules went on with a green in which one of each side comes in.
+    assert delay["recommended"] < min(delay["actuated"], delay["delay_based"])

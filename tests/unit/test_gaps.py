@@ -28,11 +28,18 @@ BINS = 12
 
 
 def queues(
-    waiting: float, towards_veh: float, come_veh: float = 0.0, *, beside: bool = False, flowing: float = 1.0
+    waiting: float,
+    towards_veh: float,
+    come_veh: float = 0.0,
+    *,
+    beside: bool = False,
+    shut: bool = False,
+    flowing: float = 1.0,
 ) -> list[float]:
     """What is left in each bin of a green of ten vehicles that give way to a queue and to who comes towards them.
 
-    Whether there are lanes `beside` theirs, of which the share `flowing` has nobody who waits in front.
+    Whether there are lanes `beside` theirs, of which the share `flowing` has nobody who waits in front, and whether he
+    waits in vain.
     """
     gaps = Gaps(
         np.array([[waiting, 0.0]]),
@@ -40,6 +47,7 @@ def queues(
         np.full((1, 2), 2.0),
         np.array([True]),
         np.array([[beside, False]]),
+        np.array([[shut, False]]),
         np.ones((1, 2)),
         np.ones((1, 2)),
         2.0,
@@ -55,6 +63,18 @@ def queues(
 
 def test_with_nobody_towards_him_he_goes_as_if_he_had_way() -> None:
     assert queues(1.0, 0.0) == pytest.approx(np.maximum(10.0 - np.arange(1, BINS + 1), 0.0))
+
+
+@given(share=st.floats(0.05, 1.0), more=st.floats(0.0, 0.5), towards=st.floats(0.0, 5.0))
+def test_before_a_road_within_the_junction_that_has_red_a_lane_goes_up_to_the_first_who_takes_it(
+    share: float, more: float, towards: float
+) -> None:
+    left = queues(share, towards, shut=True)
+    # It is no matter who comes towards them, and the sooner one takes that road the fewer go.
+    assert left == pytest.approx(queues(share, 0.0, shut=True))
+    assert left[0] == pytest.approx(9.0)
+    assert left[-1] <= queues(min(share + more, 1.0), towards, shut=True)[-1] + 1e-9
+    assert queues(1.0, towards, shut=True)[-1] == pytest.approx(9.0)
 
 
 def test_hardly_anybody_goes_until_the_queue_towards_him_has() -> None:
@@ -104,7 +124,7 @@ def test_two_of_a_lane_that_stands_for_a_gap_go_as_its_green_ends_and_none_of_on
 ) -> None:
     gaps = Gaps(
         np.array([[0.3, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.full((1, 2), 2.0), np.array([True]),
-        np.array([[False, False]]), np.ones((1, 2)), np.ones((1, 2)), 2.0,
+        *np.zeros((2, 1, 2), dtype=bool), np.ones((1, 2)), np.ones((1, 2)), 2.0,
     )  # fmt: skip
     veh, amid, going = np.array([queued_veh, 5.0]), np.ones(2), np.array([[0, 1, -1]])
     clear(0, veh, np.full(2, float(lanes)), going, gaps, np.array([pace, 0.0]), np.array([to_come, 1.0]), amid)
@@ -145,8 +165,9 @@ def test_nobody_waits_for_gaps_on_lanes_from_which_hardly_anybody_turns(street_o
     held = np.zeros((len(streams.stage), int(np.diff(streams.first).max())), dtype=bool)
     giving = Giving(network, streams, none, 2.0, held, np.array([4]))
     for share, waits in ((0.3, True), (0.02, True), (0.002, False)):
-        of_set = streams.shares(network.fraction).way_of_set
-        giving.take_up(np.where(of_set < 1, share, of_set))
+        shares = streams.shares(network.fraction)
+        of_set = shares.way_of_set
+        giving.take_up(shares._replace(way_of_set=np.where(of_set < 1, share, of_set)))
         assert (giving.gaps.waiting > 0).any() == giving.gaps.some.any() == waits
 
 
@@ -165,17 +186,17 @@ def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
     streams, stages = Streams(network), network.junctions[0].stages
     learnt, held = (np.zeros((len(stages), count), dtype=bool) for count in (len(network.lane_sets), len(streams.link)))
     giving = Giving(network, streams, learnt, 2.0, held, np.array([cycle_lost_bins]))
-    of_set = streams.shares(network.fraction).way_of_set
-    giving.take_up(np.where(of_set < 1, left_share, of_set))
+    shares = streams.shares(network.fraction)
+    giving.take_up(shares._replace(way_of_set=np.where(shares.way_of_set < 1, left_share, shares.way_of_set)))
     rows, everywhere = np.argsort(streams.stage), np.ones(1, dtype=bool)
     waiting, seen = by_the_line(np.full(len(network.lane_sets), 5.0)), []
     stands = int(streams.lane_set[np.flatnonzero(giving.gaps.waiting[rows[stages[0]]] > 0)[0]])
-    left = np.zeros(len(network.lane_sets))
+    left, nobody = np.zeros(len(network.lane_sets)), np.zeros(len(streams.link), dtype=bool)
     for time_s in np.arange(0.0, 42.0, 2.0):
         stage, begin_s = (stages[0], 0.0) if time_s < 30 else (stages[1], 30.0)
         left += np.where(np.arange(len(left)) == stands, 0.0, 2.0)
         now = replace(scene(network, float(time_s), np.array([stage])), begin_s=np.array([begin_s]), left_veh=left)
-        giving.look(now, everywhere, rows[now.stage], waiting)
+        giving.look(now, everywhere, rows[now.stage], waiting, nobody)
         shown = giving.gaps.flowing[rows[stage], : len(streams.link)]
         assert (shown[streams.lane_set != stands] == 1).all()
         seen.append(float(shown[streams.lane_set == stands][0]))

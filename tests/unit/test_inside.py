@@ -35,6 +35,9 @@ class Traffic:
     def stuck_veh(self, turn: int) -> float:
         return self.standing_veh[turn]
 
+    def standing_amid_veh(self, turn: int) -> float:
+        return self.standing_veh[turn]
+
     def close_veh(self, group: int) -> float:
         return self.coming_veh[group]
 

@@ -107,6 +107,7 @@ class Crossing:
             np.full(shape, self.amid_veh),
             (waiting > 0).any(axis=1),
             np.zeros(shape, dtype=np.bool_),
+            np.zeros(shape, dtype=np.bool_),
             np.full(shape, self.flowing),
             np.full(shape, self.to_come),
             2.0,

@@ -33,12 +33,16 @@ class Scene:
     calling: Floats
     side_stand_veh: Floats
     side_gone_veh: Floats
+    amid_veh: Floats
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:
         return (
             np.where(junctions[self.set_junction][:, None], self.set_zone_veh, 0.0),
             np.where(junctions[self.link_junction][:, None], self.link_zone_veh, 0.0),
         )
+
+    def standing_amid_veh(self, turn: int) -> float:
+        return float(self.amid_veh[turn])
 
     def side_standing_veh(self, roads: Bools) -> Floats:
         return np.where(roads, self.side_stand_veh, 0.0)
@@ -91,6 +95,7 @@ def scene(
         np.zeros(len(network.callers)),
         np.zeros(len(network.side_roads)),
         np.zeros(len(network.side_roads)),
+        np.zeros(len(network.turns)),
     )
 
 

@@ -18,6 +18,7 @@ from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.sides import Sides
 from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
+from utn_controllers.scheduled.within import Within
 from utn_controllers.scheduled.worth import Worth
 from utn_controllers.scheduled.yielding import Yielding
 from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network, Plan, State, View
@@ -81,6 +82,7 @@ class Scheduled:
             starving=self.settings.starving,
             full=self.settings.full,
         )
+        self._within = Within(network, self._streams)
         self._parked = Parked(network, self._streams)
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
@@ -134,9 +136,10 @@ class Scheduled:
         parked_veh = self._parked.leave_out(view.time_s, view.free, present, zones[0])
         outlook = self._outlook
         stand, come, held = outlook.look(view, zones, parked_veh)
+        self._within.look(view, zones[0][:, 0], outlook.shares.of_link, stand, held)
         stuck = self._standstill.look(view, present, stand)
         self._yielding.look(view, view.free, present, zones[0])
-        self._giving.look(view, view.free, present, zones[0])
+        self._giving.look(view, view.free, present, zones[0], self._within.before)
         worth, most = self._worth.look(
             view.time_s, view.free, zones, view.x_veh, outlook.shares, self._most, stuck, held
         )
@@ -190,7 +193,7 @@ class Scheduled:
         self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody, calling))
 
     def _take_up(self) -> None:
-        self._giving.take_up(self._outlook.shares.way_of_set)
+        self._giving.take_up(self._outlook.shares)
         flow_veh_s = self.network.set_saturation_flow_veh_s[self._streams.lane_set]
         self._most = self.settings.discharge * flow_veh_s * BIN_S * self._outlook.shares.of_set
 
@@ -220,6 +223,9 @@ class _Nobody:
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:  # noqa: ARG002 - nobody is anywhere
         return self.zones
+
+    def standing_amid_veh(self, turn: int) -> float:  # noqa: ARG002
+        return 0.0
 
     def side_standing_veh(self, roads: Bools) -> Floats:
         return np.zeros(len(roads))

@@ -18,6 +18,9 @@ Who waits amid the junction has left his lane, and who is behind him will not go
 stand for a gap, nobody more of it goes as the green ends. Schedules go by that where clearances are long or most of a
 lane waits. Elsewhere it was found to do harm: a green that ends the sooner costs little there.
 
+Where the road that he goes onto leads to another signal of the same junction a few metres on, and that has red, nobody
+finds a gap: the first stands amid the junction until a stage lets him off it, and has left his lane (within.py).
+
 Where another stage of the junction has a lane set to itself, yielding.py has learnt what it does.
 """
 
@@ -28,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from utn_controllers.scheduled.standstill import ROOM, Shown
-from utn_controllers.scheduled.streams import Streams
+from utn_controllers.scheduled.streams import Shares, Streams
 from utn_controllers.scheduled.yielding import START_S
 from utn_sumo.clearances import GIVES_WAY, HAS_WAY
 from utn_sumo.compiling import compiled, inlined
@@ -50,6 +53,8 @@ NO_GAP_VEH = 20.0
 """With so many coming while a gap must last there is none."""
 SOME_VEH = 1e-3
 """With fewer than so many nobody waits for one."""
+LEAST_TRAFFIC = 1e-9
+"""Share of a link's traffic that is none."""
 SOME_SHARE = 0.01
 """Of a lane's traffic: fewer who would wait for gaps are none."""
 LONG_BINS = 4
@@ -74,6 +79,8 @@ class Gaps(NamedTuple):
     """(S,) whether anybody waits for gaps."""
     beside: Bools
     """(S, most streams of a junction) whether there are lanes beside its own that move in another way."""
+    shut: Bools
+    """(S, most streams of a junction) whether who waits does so in vain: for a road within the junction with red."""
     flowing: Floats
     """(S, most streams of a junction) share of its discharge that it is thought to have in the stage that is shown: as
     its lanes have had of late where somebody waits or stands, otherwise all."""
@@ -96,13 +103,20 @@ class Giving:
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
         """(S, V) signalled ways that wait for gaps in a stage."""
         foes: dict[tuple[int, int], set[int]] = {}
+        self._within: list[tuple[int, int, int]] = []
+        """Stages, ways that they let onto a road within the junction, and which."""
         self._first_way = np.searchsorted(streams.way_stream, streams.first)
         """(J + 1,) where the junctions' ways begin."""
         for row, stage in enumerate(streams.stage):
             junction = network.stage_junction[stage]
             for way in range(*self._first_way[junction : junction + 2]):
                 stream = streams.way_stream[way]
-                if streams.serves[row, stream] and not learnt[row, streams.lane_set[stream]]:
+                if not streams.serves[row, stream]:
+                    continue
+                ahead = int(streams.next_link[stream])
+                if ahead != EXIT and network.within[ahead]:
+                    self._within.append((row, way, ahead))
+                if not learnt[row, streams.lane_set[stream]]:
                     own = _foes(network, streams, row, int(stage), way)
                     self._waits[row, way] = len(own) > 0
                     foes.setdefault((row, int(streams.lane_set[stream])), set()).update(own)
@@ -113,10 +127,12 @@ class Giving:
             amid_veh=np.where(held, 0.0, AMID_VEH),
             some=np.zeros(shape[0], dtype=np.bool_),
             beside=np.zeros(shape, dtype=np.bool_),
+            shut=np.zeros(shape, dtype=np.bool_),
             flowing=np.ones(shape),
             to_come=np.ones(shape),
             per_veh=GAP_S / bin_s,
         )
+        self._amid_veh = self.gaps.amid_veh.copy()
         sets_of_link = np.bincount(network.set_link, minlength=len(network.links))
         for row, stage in enumerate(streams.stage):
             first, last = streams.first[network.stage_junction[stage] :][:2]
@@ -135,33 +151,52 @@ class Giving:
         """(J,) when that was."""
         self._left_veh = np.zeros(len(network.lane_sets))
         """(L,) who had left by then."""
-        self._is_needed = any(foes.values())
+        self._is_needed = any(foes.values()) or len(self._within) > 0
         lanes = np.array([link.lanes for link in network.links])
         self._full_veh = np.where(network.storage_veh < SHORT_VEH * lanes, ROOM * network.storage_veh, np.inf)
         """(Z,) vehicles on a short link with which it may be full."""
 
-    def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats) -> None:
-        """Take up how fast those go who have green before the junctions `asked` (J,); as Yielding.look."""
+    def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats, amid: Bools) -> None:
+        """Take up how fast those go who have green before the junctions `asked` (J,); as Yielding.look.
+
+        Of lanes of streams `amid` (N,) somebody stands before a road within the junction.
+        """
         if self._is_needed:
             network, streams = self._network, self._streams
             _see(
                 view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0], view.x_veh >= self._full_veh,
-                network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._long, self._flowing,
-                self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.next_link, streams.first,
-                self.gaps,
+                amid, network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._long,
+                self._flowing, self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.next_link,
+                streams.first, self.gaps,
             )  # fmt: skip
 
-    def take_up(self, of_set: Floats) -> None:
-        """Go by these shares (V,) that signalled ways have of their lane sets' traffic from now on."""
-        streams = self._streams
+    def take_up(self, shares: Shares) -> None:
+        """Go by these shares of traffic from now on."""
+        streams, of_set = self._streams, shares.way_of_set
+        red = self._red(shares.of_link)
         for junction, (first, last) in enumerate(zip(streams.first[:-1], streams.first[1:], strict=True)):
             ways = slice(*self._first_way[junction : junction + 2])
             alike = streams.lane_set[first:last, None] == streams.lane_set[streams.way_stream[ways]]
             for row in range(*streams.first_stage[junction : junction + 2]):
-                own = alike @ (of_set[ways] * self._waits[row, ways]) * streams.serves[row, first:last]
+                serves = streams.serves[row, first:last]
+                own = alike @ (of_set[ways] * np.maximum(self._waits[row, ways], red[row, ways])) * serves
                 own[own < SOME_SHARE] = 0.0
+                shut = alike @ (of_set[ways] * red[row, ways]) * serves >= SOME_SHARE
+                self.gaps.shut[row, : last - first] = shut
+                self.gaps.amid_veh[row, : last - first] = np.where(shut, 0.0, self._amid_veh[row, : last - first])
                 self.gaps.waiting[row, : last - first] = own
                 self.gaps.some[row] = (own > 0).any()
+
+    def _red(self, of_link: Floats) -> Floats:
+        """(S, V) share of each way that stands amid the junction, before a road within it that has red for him.
+
+        By the shares `of_link` (N,) that streams have of their links' traffic.
+        """
+        streams, red = self._streams, np.zeros(self._waits.shape)
+        for row, way, ahead in self._within:
+            onward = streams.link == ahead
+            red[row, way] = of_link[onward & ~streams.serves[row]].sum() / max(of_link[onward].sum(), LEAST_TRAFFIC)
+        return red
 
 
 def _foes(network: Network, streams: Streams, row: int, stage: int, way: int) -> set[int]:
@@ -181,7 +216,7 @@ def _foes(network: Network, streams: Streams, row: int, stage: int, way: int) ->
 
 @compiled
 def _see(
-    time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, full: Bools,
+    time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, full: Bools, amid: Bools,
     flow: Floats, set_junction: Ints, long: Bools, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats,
     stream_set: Ints, next_link: Ints, first: Ints, gaps: Gaps,
 ) -> None:  # fmt: skip
@@ -207,6 +242,8 @@ def _see(
             for stream in range(first[junction], first[junction + 1]):
                 own, share = stream - first[junction], flowing[stream_set[stream]]
                 stands = gaps.waiting[row, own] > 0 or behind[stream_set[stream]] or share < STANDING
+                # Who stands amid it has taken the room that there was: whoever comes next for it stops the lane.
+                share = min(share, 1 - amid[stream] * gaps.shut[row, own] * gaps.waiting[row, own])
                 gaps.flowing[row, own] = share if stands else 1.0
                 counts = gaps.waiting[row, own] > 0 and (long[junction] or gaps.waiting[row, own] >= MOST_SHARE)
                 gaps.to_come[row, own] = share if counts and gaps.beside[row, own] else 1.0
@@ -233,7 +270,8 @@ def let_go(
     while going[row, place] >= 0:
         stream = going[row, place]
         if gaps.waiting[row, stream] > 0:
-            towards, foe, share, beside = 0.0, 0, gaps.waiting[row, stream], gaps.beside[row, stream]
+            shut, foe, share = gaps.shut[row, stream], 0, gaps.waiting[row, stream]
+            towards, beside = np.inf if shut else 0.0, shut or gaps.beside[row, stream]
             while gaps.foes[row, stream, foe] >= 0:
                 other = gaps.foes[row, stream, foe]
                 towards += want[other]

@@ -186,12 +186,16 @@ class Eyes:
         """Of a turn that may wait amid the junction, on its lanes there."""
         return float(sum(map(self._present, self._amid[turn])))
 
+    def standing_amid_veh(self, turn: int) -> float:
+        """Of a turn that may wait amid the junction, standing or creeping on its lanes there."""
+        return float(sum(map(self._halting, self._amid[turn])))
+
     def stuck_veh(self, turn: int) -> float:
         """Of a turn, standing or creeping on its lanes amid the junction; none where the road ahead may be why."""
         # Somebody is on its entry loops: it is full, or has just let one more in.
         if any(since_s <= 0 for since_s in map(self._since_s, self._ahead[turn])):
             return 0.0
-        return float(sum(map(self._halting, self._amid[turn])))
+        return self.standing_amid_veh(turn)
 
     def close_veh(self, group: int) -> float:
         """In the zones of one lane group up to CLOSE_ZONES, moving or not."""
@@ -272,6 +276,7 @@ class Sight:
         self.close_one_veh = eyes.close_one_veh
         self.gap_one_s = eyes.gap_one_s
         self.zone_veh = eyes.zone_veh
+        self.standing_amid_veh = eyes.standing_amid_veh
         self.side_standing_veh = eyes.side_standing_veh
         self.side_left_veh = partial(eyes.side_left_veh, time_s)
         self._eyes = eyes

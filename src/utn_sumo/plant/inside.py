@@ -7,6 +7,9 @@ too, turning or not: by those who step onto the crossing at its exit with the ne
 goes straight on from a lane that turns share may stand behind one of them until the green has ended, and is amid the
 junction when the next road's turns come into it. So while the lane-area detectors amid it see such vehicles, and others
 are about to come into their way, the red before the next green lasts.
+
+Who stands before a road within the junction has the next green for himself where there are several: those from opposite
+sides stand in each other's way, and with others who come in nobody gets out any more.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ class Areas(Protocol):
 
     def amid_veh(self, turn: int) -> float: ...
     def stuck_veh(self, turn: int) -> float: ...
+    def standing_amid_veh(self, turn: int) -> float: ...
     def close_veh(self, group: int) -> float: ...
 
 
@@ -56,6 +60,10 @@ class Way:
     stopped: tuple[tuple[int, tuple[int, ...]], ...]
     """Turns that people who walk may stop, or one before them that found no gap, each with the lane groups that come
     into its way."""
+    within: tuple[int, ...]
+    """Turns onto roads within the junction that have green in the next stage."""
+    outwards: str
+    """The letters of that stage with those red that do not lead off such roads."""
 
 
 class Inside:
@@ -76,8 +84,12 @@ class Inside:
 
     def may_hold(self) -> Bools:
         """(J,) junctions in which somebody may be left."""
-        may = zip(self._turnings, self._network.junctions, strict=True)
-        return np.array([len(each) > 0 or junction.is_walked for each, junction in may], dtype=np.bool_)
+        network = self._network
+        within = set(network.link_junction[network.within].tolist())
+        may = enumerate(zip(self._turnings, network.junctions, strict=True))
+        return np.array(
+            [len(own) > 0 or each.is_walked or index in within for index, (own, each) in may], dtype=np.bool_
+        )
 
     def leads(self, index: int, first: int, then: int, opens_s: float) -> None:
         """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`."""
@@ -114,13 +126,21 @@ class Inside:
         )
         # To the stage that follows it is the net's own clearance, to the second, but for who walks or is stuck.
         is_own = then == following(junction, first)
-        return Way(() if is_own else tuple(left), tuple(coming), stopped)
+        within, outwards = _outwards(network, junction, becomes)
+        return Way(() if is_own else tuple(left), tuple(coming), stopped, within, outwards)
+
+    def outwards(self, index: int) -> str:
+        """Letters by which they are let out who stand before a road within the junction, empty if nobody does."""
+        way, _ = self._ways[index]
+        return way.outwards if sum(map(self._areas.standing_amid_veh, way.within)) > BESIDE_VEH else ""
 
     def holds(self, index: int, now_s: float) -> bool:
         """Whether the stage that a junction is led to has to wait for somebody."""
         (way, until_s), areas = self._ways[index], self._areas
         if now_s >= until_s:
             return False
+        if self.outwards(index):
+            return True
         found_no_gap_veh = sum(areas.amid_veh(turn) for turn in way.left)
         if any(found_no_gap_veh > veh and areas.close_veh(group) > 0 for group, veh in way.coming):
             return True
@@ -129,6 +149,21 @@ class Inside:
             turn in late and areas.amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
             for turn, groups in way.stopped
         )
+
+
+def _outwards(network: Network, junction: Junction, state: str) -> tuple[tuple[int, ...], str]:
+    """Turns onto roads within a junction off which a state lets, and that state with green for who leaves them alone.
+
+    None where nobody else has green in it.
+    """
+    leads = [
+        {network.turns[turn].link for turn in turns if network.within[network.turns[turn].link]}
+        for turns in junction.signal_turns
+    ]
+    outwards = "".join(shown if off or shown not in GREEN else "r" for shown, off in zip(state, leads, strict=True))
+    links = {link for shown, off in zip(state, leads, strict=True) if shown in GREEN for link in off}
+    turns = tuple(index for index, turn in enumerate(network.turns) if turn.next_link in links)
+    return (turns, outwards) if outwards != state else ((), "")
 
 
 def _sharing(network: Network, giving: set[int]) -> set[int]:
