@@ -35,9 +35,9 @@ ZONES_M = (22.0, 50.0, 85.0, 130.0, AREA_REACH_M)
 """How far from the stop line the zones end in which they say where vehicles are: the nearer the finer."""
 CLOSE_ZONES = 2
 """Who is in these, up to 50 m, is at the stop line within a few seconds."""
-WITHIN_VEH = 3.0
-"""Roads from one node of a junction to another that hold fewer vehicles a lane are within it: who waits there is in the
-way."""
+WITHIN_VEH = 2.0
+"""Roads from one node with a signal to another that hold fewer vehicles a lane are within a junction: who waits there
+is in the way."""
 SAMPLE_S = 10.0
 """Longest time between two readings of the entry loops (the paper's sampling interval)."""
 LEAST_PAUSE_S = 1.0
@@ -281,18 +281,15 @@ class Network:
 
     @cached_property
     def within(self) -> Bools:
-        """(Z,) links from one node to another of a junction, that hold fewer than WITHIN_VEH a lane.
+        """(Z,) links from one node with a signal to another, of one junction or of two, that hold few vehicles.
 
-        Who has to wait at their end stands amid the junction, in the way of all behind him.
+        With fewer than WITHIN_VEH a lane both nodes are one junction in truth: who has to wait between stands amid it,
+        in the way of all behind him.
         """
         within = np.zeros(len(self.links), dtype=np.bool_)
-        for turn in self.turns:
-            if turn.next_link != EXIT:
-                ahead = self.links[turn.next_link]
-                room_veh = ahead.length_m / (ahead.queue_spacing_m * ahead.lanes)
-                is_one = ahead.junction == self.links[turn.link].junction
-                within[turn.next_link] |= is_one and room_veh < WITHIN_VEH
-        return within
+        within[self.turn_next[self.turn_next != EXIT]] = True
+        room_veh = [link.length_m / (link.queue_spacing_m * link.lanes) for link in self.links]
+        return within & (np.array(room_veh) < WITHIN_VEH)
 
     @cached_property
     def callers(self) -> tuple[tuple[int, Caller], ...]:
@@ -777,7 +774,7 @@ class View(Protocol):
         ...
 
     def standing_amid_veh(self, turn: int) -> float:
-        """Vehicles of one turn onto a link within its junction (`Network.within`) that stand or creep amid it."""
+        """Vehicles of one turn onto a link within a junction (`Network.within`) that stand or creep amid it."""
         ...
 
     def side_standing_veh(self, roads: Bools) -> Floats:

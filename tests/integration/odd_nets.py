@@ -441,14 +441,16 @@ def joined(folder: Path) -> Path:
     return case(folder, traffic("AB"))
 
 
-def carriageways(folder: Path, apart_m: float = 14, left_veh_h: float = 110, end_s: int = 300) -> Path:
-    """A main road whose carriageways are apart and a street across it, under one programme: a road within the junction.
+def carriageways(
+    folder: Path, apart_m: float = 14, left_veh_h: float = 110, end_s: int = 300, *, signals: str = "JJ"
+) -> Path:
+    """A main road whose carriageways are apart and a street across it, under these signals: a road within the junction.
 
     Who turns left off a carriageway waits amid the junction until the street has green.
     """
     streets = Streets()
-    for name, y in (("a", 0.0), ("b", apart_m)):
-        streets.node(name, 0, y, "traffic_light", tl="J")
+    for name, y, signal in zip("ab", (0.0, apart_m), signals, strict=True):
+        streets.node(name, 0, y, "traffic_light", tl=signal)
     for name, x, y in (("W", -1, 0), ("F", 1, 0), ("E", 1, apart_m), ("V", -1, apart_m)):
         streets.node(name, x * ARM_M, y)
     for start, end in (("W", "a"), ("a", "F"), ("E", "b"), ("b", "V")):

@@ -34,13 +34,17 @@ def turn(network: Network, start: str, end: str) -> int:
     return ways.index((start, end))
 
 
-def test_short_roads_between_nodes_of_one_signal_are_within_the_junction(street_of: StreetOf) -> None:
-    assert within(street_of(odd_nets.carriageways)) == {"a-b", "b-a"}
-    assert within(street_of(lambda folder: odd_nets.carriageways(folder, 24))) == {"a-b", "b-a"}
+@pytest.mark.parametrize("signals", ["JJ", "JK"])
+@pytest.mark.parametrize(("apart_m", "is_short"), [(14, True), (20, True), (40, False)])
+def test_short_roads_between_nodes_with_signals_are_within_a_junction(
+    *, apart_m: float, is_short: bool, signals: str, street_of: StreetOf
+) -> None:
+    network = street_of(lambda folder: odd_nets.carriageways(folder, apart_m, signals=signals))
+    assert within(network) == ({"a-b", "b-a"} if is_short else set())
 
 
-@pytest.mark.parametrize("make", [odd_nets.plain, odd_nets.joined, lambda folder: odd_nets.carriageways(folder, 60)])
-def test_longer_roads_and_those_between_signals_are_not(street_of: StreetOf, make: Callable[[Path], Path]) -> None:
+@pytest.mark.parametrize("make", [odd_nets.plain, odd_nets.joined, odd_nets.side_streets])
+def test_other_roads_are_not(street_of: StreetOf, make: Callable[[Path], Path]) -> None:
     assert not within(street_of(make))
 
 
@@ -69,6 +73,23 @@ def test_left_turns_wait_in_vain_for_as_long_as_the_road_within_has_red(street_o
         # By the main road's green they come in, by the street's they get out; who comes along the street goes through.
         assert gaps.shut[row, turning].all() == streams.serves[row, turning].all() != streams.serves[row, onward].all()
         assert not gaps.shut[row, np.isin(streams.link, (link["S-a"], link["N-b"]))].any()
+
+
+def test_before_another_signal_they_wait_in_vain_as_long_as_it_shows_red(street_of: StreetOf) -> None:
+    network = street_of(lambda folder: odd_nets.carriageways(folder, signals="JK"))
+    execution, link = Scheduled(network), {each.id: index for index, each in enumerate(network.links)}
+    streams, gaps = execution._streams, execution._giving.gaps
+    near, far = (int(network.link_junction[link[each]]) for each in ("W-a", "a-b"))
+    turning = (streams.link == link["W-a"]) & (streams.next_link == link["a-b"])
+    onward, row = streams.link == link["a-b"], np.argsort(streams.stage)
+    for stage in (*network.junctions[far].stages, *network.junctions[far].stages):
+        shown = np.array([each.stages[0] for each in network.junctions])
+        shown[far] = stage
+        execution.wish(scene(network, stage=shown))
+        for own in network.junctions[near].stages:
+            if streams.serves[row[own], turning].all():
+                shut = gaps.shut[row[own], turning[streams.first[near] : streams.first[near + 1]].nonzero()[0]]
+                assert shut.all() == shut.any() != streams.serves[row[stage], onward].any()
 
 
 @pytest.mark.parametrize(("free", "amid_veh", "near_veh"), [(True, 1, 0), (True, 0, 1), (True, 0, 0), (False, 1, 0)])

@@ -18,8 +18,8 @@ Who waits amid the junction has left his lane, and who is behind him will not go
 stand for a gap, nobody more of it goes as the green ends. Schedules go by that where clearances are long or most of a
 lane waits. Elsewhere it was found to do harm: a green that ends the sooner costs little there.
 
-Where the road that he goes onto leads to another signal of the same junction a few metres on, and that has red, nobody
-finds a gap: the first stands amid the junction until a stage lets him off it, and has left his lane (within.py).
+Where the road that he goes onto leads to another signal a few metres on, of the same junction or not, and that has red,
+nobody finds a gap: the first stands amid the junction until a stage lets him off it, and has left his lane (within.py).
 
 Where another stage of the junction has a lane set to itself, yielding.py has learnt what it does.
 """
@@ -103,8 +103,8 @@ class Giving:
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)
         """(S, V) signalled ways that wait for gaps in a stage."""
         foes: dict[tuple[int, int], set[int]] = {}
-        self._within: list[tuple[int, int, int]] = []
-        """Stages, ways that they let onto a road within the junction, and which."""
+        self._within: dict[int, list[tuple[int, int, int]]] = {}
+        """By junction stages, ways that they let onto a road within it, and which."""
         self._first_way = np.searchsorted(streams.way_stream, streams.first)
         """(J + 1,) where the junctions' ways begin."""
         for row, stage in enumerate(streams.stage):
@@ -115,7 +115,7 @@ class Giving:
                     continue
                 ahead = int(streams.next_link[stream])
                 if ahead != EXIT and network.within[ahead]:
-                    self._within.append((row, way, ahead))
+                    self._within.setdefault(int(junction), []).append((row, way, ahead))
                 if not learnt[row, streams.lane_set[stream]]:
                     own = _foes(network, streams, row, int(stage), way)
                     self._waits[row, way] = len(own) > 0
@@ -152,6 +152,14 @@ class Giving:
         self._left_veh = np.zeros(len(network.lane_sets))
         """(L,) who had left by then."""
         self._is_needed = any(foes.values()) or len(self._within) > 0
+        self._beyond: dict[int, set[int]] = {}
+        """By junction others a few metres on, whose signals end roads within it."""
+        for index, onto in self._within.items():
+            if others := {int(network.link_junction[ahead]) for _, _, ahead in onto} - {index}:
+                self._beyond[index] = others
+        self._shown = streams.first_stage[:-1].astype(np.int64)
+        """(J,) row of the stage that each junction has shown."""
+        self._shares = streams.shares(network.fraction)
         lanes = np.array([link.lanes for link in network.links])
         self._full_veh = np.where(network.storage_veh < SHORT_VEH * lanes, ROOM * network.storage_veh, np.inf)
         """(Z,) vehicles on a short link with which it may be full."""
@@ -163,6 +171,10 @@ class Giving:
         """
         if self._is_needed:
             network, streams = self._network, self._streams
+            changed, self._shown = set(np.flatnonzero(self._shown != present).tolist()), present.copy()
+            for junction, others in self._beyond.items():
+                if not others.isdisjoint(changed):
+                    self._take_up(junction)
             _see(
                 view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0], view.x_veh >= self._full_veh,
                 amid, network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._long,
@@ -172,30 +184,36 @@ class Giving:
 
     def take_up(self, shares: Shares) -> None:
         """Go by these shares of traffic from now on."""
-        streams, of_set = self._streams, shares.way_of_set
-        red = self._red(shares.of_link)
-        for junction, (first, last) in enumerate(zip(streams.first[:-1], streams.first[1:], strict=True)):
-            ways = slice(*self._first_way[junction : junction + 2])
-            alike = streams.lane_set[first:last, None] == streams.lane_set[streams.way_stream[ways]]
-            for row in range(*streams.first_stage[junction : junction + 2]):
-                serves = streams.serves[row, first:last]
-                own = alike @ (of_set[ways] * np.maximum(self._waits[row, ways], red[row, ways])) * serves
-                own[own < SOME_SHARE] = 0.0
-                shut = alike @ (of_set[ways] * red[row, ways]) * serves >= SOME_SHARE
-                self.gaps.shut[row, : last - first] = shut
-                self.gaps.amid_veh[row, : last - first] = np.where(shut, 0.0, self._amid_veh[row, : last - first])
-                self.gaps.waiting[row, : last - first] = own
-                self.gaps.some[row] = (own > 0).any()
+        self._shares = shares
+        for junction in range(len(self._network.junctions)):
+            self._take_up(junction)
 
-    def _red(self, of_link: Floats) -> Floats:
-        """(S, V) share of each way that stands amid the junction, before a road within it that has red for him.
+    def _take_up(self, junction: int) -> None:
+        streams, gaps, of_set = self._streams, self.gaps, self._shares.way_of_set
+        first, last = streams.first[junction : junction + 2]
+        ways = slice(*self._first_way[junction : junction + 2])
+        alike = streams.lane_set[first:last, None] == streams.lane_set[streams.way_stream[ways]]
+        rows = range(*streams.first_stage[junction : junction + 2])
+        for row, red in zip(rows, self._red(junction), strict=True):
+            serves, own = streams.serves[row, first:last], slice(last - first)
+            waiting = alike @ (of_set[ways] * np.maximum(self._waits[row, ways], red)) * serves
+            waiting[waiting < SOME_SHARE] = 0.0
+            shut = alike @ (of_set[ways] * red) * serves >= SOME_SHARE
+            gaps.waiting[row, own], gaps.shut[row, own] = waiting, shut
+            gaps.amid_veh[row, own] = np.where(shut, 0.0, self._amid_veh[row, own])
+            gaps.some[row] = (waiting > 0).any()
 
-        By the shares `of_link` (N,) that streams have of their links' traffic.
-        """
-        streams, red = self._streams, np.zeros(self._waits.shape)
-        for row, way, ahead in self._within:
-            onward = streams.link == ahead
-            red[row, way] = of_link[onward & ~streams.serves[row]].sum() / max(of_link[onward].sum(), LEAST_TRAFFIC)
+    def _red(self, junction: int) -> Floats:
+        """By stage and way of a junction the share that stands amid it, before a road within it that has red."""
+        streams, of_link = self._streams, self._shares.of_link
+        first_row, first_way = streams.first_stage[junction], self._first_way[junction]
+        red = np.zeros((streams.first_stage[junction + 1] - first_row, self._first_way[junction + 1] - first_way))
+        for row, way, ahead in self._within.get(junction, ()):
+            onward, there = streams.link == ahead, int(self._network.link_junction[ahead])
+            # Another signal is thought to stay as it is.
+            shown = row if there == junction else self._shown[there]
+            stands = of_link[onward & ~streams.serves[shown]].sum()
+            red[row - first_row, way - first_way] = stands / max(of_link[onward].sum(), LEAST_TRAFFIC)
         return red
 
 
