@@ -73,6 +73,11 @@ class Link:
     entry_flow_veh_s: float = np.inf
     """Most that comes from outside however much room there is: where its vehicles are inserted is not the road's."""
 
+    @property
+    def lane_room_veh(self) -> float:
+        """Vehicles that stand on a lane along its whole length, however short: `storage_veh` is never so few."""
+        return self.length_m / (self.queue_spacing_m * self.lanes)
+
 
 @dataclass(frozen=True)
 class LaneGroup:
@@ -288,8 +293,7 @@ class Network:
         """
         within = np.zeros(len(self.links), dtype=np.bool_)
         within[self.turn_next[self.turn_next != EXIT]] = True
-        room_veh = [link.length_m / (link.queue_spacing_m * link.lanes) for link in self.links]
-        return within & (np.array(room_veh) < WITHIN_VEH)
+        return within & (np.array([link.lane_room_veh for link in self.links]) < WITHIN_VEH)
 
     @cached_property
     def callers(self) -> tuple[tuple[int, Caller], ...]:

@@ -79,6 +79,6 @@ def _road(network: Network, streams: Streams, link: int) -> Road:
         np.flatnonzero(network.set_link == link),
         np.flatnonzero(network.group_link == link),
         np.flatnonzero(streams.link == link),
-        max(each.length_m // (each.queue_spacing_m * each.lanes), 1.0),
+        max(each.lane_room_veh // 1, 1.0),
         tuple((turn, np.flatnonzero(np.isin(streams.lane_set, own))) for turn, own in zip(turns, sets, strict=True)),
     )
