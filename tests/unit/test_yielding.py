@@ -27,7 +27,8 @@ QUEUE_VEH = 8.0
 def left_turns(network: Network) -> list[int]:
     """Lane groups that give way in one stage and have another one to themselves."""
     streams = Streams(network)
-    return np.flatnonzero(Yielding(network, streams, np.ones((len(streams.stage), 9))).learnt.any(axis=0)).tolist()
+    moves = Moves(network, streams, 2, are_alone(network, streams))
+    return np.flatnonzero(Yielding(network, streams, moves).learnt.any(axis=0)).tolist()
 
 
 def through_stage(network: Network, group: int) -> int:
@@ -74,16 +75,57 @@ def test_left_turns_in_pockets_with_arrows_give_way_and_have_a_stage_of_their_ow
     assert all(len(arrows.groups[group].lanes) == 1 for group in groups)
 
 
-@pytest.mark.parametrize("make", [odd_nets.plain, odd_nets.pedestrians])
+def walked_alone(folder: Path) -> Path:
+    """Left turns give way to other traffic, and whoever walks has green for himself."""
+    net = odd_nets.row("C").net(folder, odd_nets.NO_TURNAROUNDS, "--sidewalks.guess", "--crossings.guess")
+    cars, phases = ("GGgrrrGGgrrr", "rrrGGgrrrGGg"), []
+    for green in cars:
+        phases += [(20, green + "rrrr"), (3, green.replace("G", "y").replace("g", "y") + "rrrr")]
+    odd_nets.retime(net, odd_nets.tl_logic("C", [*phases, (10, "r" * 12 + "GGGG"), (5, "r" * 16)]))
+    return odd_nets.case(folder, odd_nets.traffic("C") + odd_nets.walkers("W-C", "C-E"))
+
+
+@pytest.mark.parametrize("make", [odd_nets.plain, walked_alone])
 def test_who_never_has_a_stage_alone_is_left_as_it_is(make: Make, street_of: StreetOf) -> None:
     assert left_turns(street_of(make)) == []
+
+
+def test_lanes_that_give_way_to_who_walks_have_what_they_had_on_average_while_he_is_cleared_too(
+    street_of: StreetOf,
+) -> None:
+    network = street_of(odd_nets.pedestrians)
+    streams = Streams(network)
+    all_moves = Moves(network, streams, 2, are_alone(network, streams))
+    learning, moves = Yielding(network, streams, all_moves), all_moves.share
+    rows, sets = learning.learnt.nonzero()
+    assert sorted(sets.tolist()) == list(range(len(network.lane_sets)))
+    # Nobody is thought to wait for gaps besides.
+    assert not Scheduled(network)._giving.gaps.some.any()
+    row, lane_set = int(rows[0]), int(sets[0])
+    own = np.flatnonzero((streams.lane_set == lane_set) & streams.serves[row])[0]
+    cleared = np.flatnonzero((all_moves.after == row) & (moves[:, own] > 0))
+    assert len(cleared) > 0
+    before = moves[cleared].copy()
+    queue = by_the_line(np.full(len(network.lane_sets), QUEUE_VEH))
+    left_veh, shares = np.zeros(len(network.lane_sets)), []
+    # Nobody goes for some seconds, then a few at once: on average 0.3 of the discharge.
+    for second in range(0, 600, 2):
+        view = replace(scene(network, float(second)), left_veh=left_veh.copy())
+        learning.look(view, np.array([True]), np.array([row]), queue)
+        shares.append(float(moves[row, own]))
+        left_veh[lane_set] += 10 * 0.3 * network.set_saturation_flow_veh_s[lane_set] * (second % 10 == 8)
+    assert shares[0] == 1.0
+    assert np.array(shares[150:]) == pytest.approx(0.3, abs=0.1)
+    assert moves[cleared, own] == pytest.approx(before[:, own] * shares[-1])
+    others = np.flatnonzero(~np.isin(np.arange(moves.shape[1]), own) & ~learning.learnt[row, streams.lane_set])
+    assert (moves[cleared][:, others] == before[:, others]).all()
 
 
 @pytest.mark.parametrize("flow", [0.0, 0.3, 1.0])
 def test_its_share_is_what_has_gone_of_late_and_is_forgotten(flow: float, arrows: Network) -> None:
     streams = Streams(arrows)
-    moves = Moves(arrows, streams, 2, are_alone(arrows, streams)).share
-    learning, group = Yielding(arrows, streams, moves), left_turns(arrows)[0]
+    all_moves = Moves(arrows, streams, 2, are_alone(arrows, streams))
+    learning, group, moves = Yielding(arrows, streams, all_moves), left_turns(arrows)[0], all_moves.share
     stage = through_stage(arrows, group)
     row, junction = np.array([streams.stage.tolist().index(stage)]), np.array([True])
     present = np.where(np.arange(len(arrows.junctions)) == arrows.stages[stage].junction, row, 0)
@@ -141,8 +183,8 @@ def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_
 ) -> None:
     network = street_of(an_arrow_for_a_shared_lane)
     streams = Streams(network)
-    moves = Moves(network, streams, 2, are_alone(network, streams)).share
-    learning = Yielding(network, streams, moves)
+    all_moves = Moves(network, streams, 2, are_alone(network, streams))
+    learning, moves = Yielding(network, streams, all_moves), all_moves.share
     arrow = next(row for row, stage in enumerate(streams.stage) if "g" not in network.stages[stage].state)
     turning = np.flatnonzero(streams.serves[arrow])
     lane_set = streams.lane_set[turning[0]]
@@ -171,8 +213,8 @@ def test_a_green_for_a_part_of_a_queue_is_of_no_use_from_when_nobody_of_it_goes_
 def test_short_greens_in_which_nobody_goes_add_up_for_all_stages_that_serve_no_more(street_of: StreetOf) -> None:
     network = street_of(parts_of_a_lane)
     streams = Streams(network)
-    moves = Moves(network, streams, 2, are_alone(network, streams)).share
-    learning = Yielding(network, streams, moves)
+    all_moves = Moves(network, streams, 2, are_alone(network, streams))
+    learning, moves = Yielding(network, streams, all_moves), all_moves.share
     shown = [network.stages[stage].state for stage in streams.stage]
     most, right, left = (shown.index(each) for each in ("GGrrrrGGrrrr", "GrrrrrGrrrrr", "rrGrrrrrrrrr"))
     across = shown.index(odd_nets.EAST_WEST)

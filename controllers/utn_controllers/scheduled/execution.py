@@ -86,7 +86,7 @@ class Scheduled:
         self._parked = Parked(network, self._streams)
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
-        self._yielding = Yielding(network, self._streams, moves.share)
+        self._yielding = Yielding(network, self._streams, moves)
         self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, moves.held, lost_bins)
         self._rules = Rules(
             stages,

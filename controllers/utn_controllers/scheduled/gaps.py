@@ -21,7 +21,8 @@ lane waits. Elsewhere it was found to do harm: a green that ends the sooner cost
 Where the road that he goes onto leads to another signal a few metres on, of the same junction or not, and that has red,
 nobody finds a gap: the first stands amid the junction until a stage lets him off it, and has left his lane (within.py).
 
-Where another stage of the junction has a lane set to itself, yielding.py has learnt what it does.
+Where another stage of the junction has a lane set to itself, and where people walk, yielding.py has learnt what it
+does.
 """
 
 from __future__ import annotations
@@ -30,9 +31,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from utn_controllers.scheduled.standstill import ROOM, Shown
+from utn_controllers.scheduled.standstill import ROOM, START_S, Shown
 from utn_controllers.scheduled.streams import Shares, Streams
-from utn_controllers.scheduled.yielding import START_S
 from utn_sumo.clearances import GIVES_WAY, HAS_WAY
 from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network

@@ -70,6 +70,7 @@ class Moves:
         rows = [
             serves[streams.first[j] : streams.first[j + 1]] for j, serves in zip(owner, streams.serves, strict=True)
         ]
+        after = [-1] * len(rows)
         self.row = np.full((len(owner), most), -1)
         """(S, most stages of a junction) where the clearance from a stage to its junction's nth begins, -1: all red."""
         self.bins = np.ones((len(owner), most), dtype=np.int64)
@@ -91,10 +92,13 @@ class Moves:
                             self.row[row, place] = known.setdefault(shares.tobytes(), len(rows))
                             if self.row[row, place] == len(rows):
                                 rows.extend(shares)
+                                after.extend([row] * len(shares))
         self.share = np.zeros((len(rows), int(sizes.max(initial=0))))
         """(R, most streams of a junction)."""
         for number, row in enumerate(rows):
             self.share[number, : len(row)] = row
+        self.after = np.array(after, dtype=np.int64)
+        """(R,) row of the stage that a bin of a clearance follows, -1 in rows of stages."""
         self.held = np.zeros((len(owner), self.share.shape[1]), dtype=np.bool_)
         """(S, most streams of a junction) those that still move in the first bin of some clearance from a stage."""
         for begins in self.row.T:

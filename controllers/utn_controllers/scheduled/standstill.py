@@ -17,6 +17,8 @@ from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.compiling import compiled
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
+START_S = 3.0
+"""From a green's begin until its flow is counted."""
 WAITING_VEH = 0.5
 """Fewer before a green than so many may be nobody."""
 QUICK_S, COSTLY_S, MOST_TIMES = 4.0, 8.0, 3.0

@@ -3,6 +3,11 @@
 A left turn that waits for gaps in what comes towards it hardly moves while that has a queue. Where another stage has
 it to itself, that one is to be shown in time.
 
+A lane of which some turn over a road on which people walk goes all green long at a third or a half of what it could,
+and while who walks is cleared too. Left turns among them find more gaps than what comes towards them would leave by
+itself, which is held up as well, and who found one may have to wait again. Taken to go fast as a green begins and to
+stand when some wait (gaps.py), such lanes would have another green whenever they stand, with all that clearances take.
+
 And who has green does not go at all while the first of his lane has red. Where a stage serves a part of a lane set and
 nobody of its queue has gone for a while, in one green or in several short ones, somebody of the other part is in front:
 that stage, and whichever serves no more of the lane set, is of no use until another one has let somebody go.
@@ -12,17 +17,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from utn_controllers.scheduled.standstill import Shown
+from utn_controllers.scheduled.moves import Moves
+from utn_controllers.scheduled.standstill import START_S, Shown
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.clearances import GIVES_WAY
+from utn_sumo.clearances import GIVES_WAY, GREEN
 from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
-START_S = 3.0
-"""From a green's begin until its flow is counted."""
-MEMORY_S = 10.0
-"""Over how much green before a queue its flow is taken."""
-FORGET_S = 300.0
+MEMORY_S, WALKED_MEMORY_S = 10.0, 120.0
+"""Over how much green before a queue its flow is taken, and that of lanes that who walks holds up: theirs is what
+they have on average, whoever is in front."""
+FORGET_S, WALKED_FORGET_S = 300.0, 900.0
 """Over how long what it was is forgotten, and the whole discharge expected again."""
 LEAST_SHARE = 0.05
 """Of the discharge: somebody may always find a gap."""
@@ -33,11 +38,17 @@ BLOCKED_S = 6.0
 class Yielding:
     """Keeps which share of its discharge each lane set has in stages in which it gives way, or in part has red."""
 
-    def __init__(self, network: Network, streams: Streams, moves: Floats):
-        """`moves` (R, most streams of a junction) of `Rules`, whose rows of stages are kept up to date."""
-        self._network, self._streams, self._moves = network, streams, moves
-        self.learnt = _give_way(network, streams)
-        """(S, L) lane sets that must give way in a stage, and not in another one."""
+    def __init__(self, network: Network, streams: Streams, moves: Moves):
+        """What each stream has of its discharge in `moves` is kept up to date."""
+        self._network, self._streams, self._moves = network, streams, moves.share
+        in_part = _give_way(network, streams)
+        among = _among_walkers(network, streams) & ~in_part
+        self.learnt = in_part | among
+        """(S, L) lane sets that must give way in a stage, and not in another one or to who walks."""
+        self._memory_s = np.where(among, WALKED_MEMORY_S, MEMORY_S)
+        self._forget_s = np.where(among, WALKED_FORGET_S, FORGET_S)
+        self._cleared = _cleared(streams, moves, among)
+        self._cleared_share = moves.share[self._cleared[:2]]
         self._partly = _partly(streams, len(network.lane_sets))
         """(S, L) lane sets of which a stage serves a part."""
         self._stood_s = np.zeros((len(network.lane_sets), int(np.diff(streams.first_stage).max())))
@@ -62,9 +73,12 @@ class Yielding:
             _learn(
                 view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0],
                 network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self.learnt, self._partly,
-                self._share, self._stood_s, self._queued, self._looked_s, self._left_veh,
-                streams.lane_set, streams.first, streams.first_stage, streams.serves, self._moves,
+                self._memory_s, self._forget_s, self._share, self._stood_s, self._queued, self._looked_s,
+                self._left_veh, streams.lane_set, streams.first, streams.first_stage, streams.serves, self._moves,
             )  # fmt: skip
+            row, place, stage, lane_set = self._cleared
+            if len(row):
+                self._moves[row, place] = self._cleared_share * self._share[stage, lane_set]
 
 
 def _give_way(network: Network, streams: Streams) -> Bools:
@@ -82,6 +96,36 @@ def _give_way(network: Network, streams: Streams) -> Bools:
     return np.asarray(gives_way & alone[junction])
 
 
+def _among_walkers(network: Network, streams: Streams) -> Bools:
+    """(S, L) lane sets of which somebody gives way in a stage in which people walk."""
+    found = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=np.bool_)
+    for row, stage in enumerate(streams.stage):
+        junction, state = network.junctions[network.stage_junction[stage]], network.stages[stage].state
+        letters = zip(state, junction.signal_turns, junction.conflicts, strict=True)
+        if any(shown in GREEN and not turns and any(conflicts) for shown, turns, conflicts in letters):
+            for stream in np.flatnonzero(streams.serves[row]):
+                gives_way = any(state[letter] == GIVES_WAY for letter in streams.letters[stream])
+                found[row, streams.lane_set[stream]] |= gives_way
+    return found
+
+
+def _cleared(streams: Streams, moves: Moves, among: Bools) -> tuple[Ints, Ints, Ints, Ints]:
+    """Where lane sets that are `among` (S, L) those who walk go on in clearances.
+
+    Rows of `Moves` and places of streams there, rows of the stages before and the lane sets.
+    """
+    going_on, lane_set = np.zeros(moves.share.shape, dtype=np.bool_), np.zeros(moves.share.shape, dtype=np.int64)
+    for row in np.flatnonzero(moves.after >= 0):
+        stage = moves.after[row]
+        junction = np.searchsorted(streams.first_stage, stage, side="right") - 1
+        own = slice(*streams.first[junction : junction + 2])
+        sets = streams.lane_set[own]
+        lane_set[row, : len(sets)] = sets
+        going_on[row, : len(sets)] = streams.serves[stage, own] & among[stage, sets]
+    rows, places = (going_on & (moves.share > 0)).nonzero()
+    return rows, places, moves.after[rows], lane_set[rows, places]
+
+
 def _partly(streams: Streams, sets: int) -> Bools:
     """(S, L) lane sets of which some streams have green in a stage and some have red."""
     some = np.zeros((len(streams.stage), sets), dtype=np.bool_)
@@ -95,18 +139,19 @@ def _partly(streams: Streams, sets: int) -> Bools:
 @compiled
 def _learn(
     time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, flow: Floats,
-    set_junction: Ints, gives_way: Bools, partly: Bools, share: Floats, stood_s: Floats, queued: Bools,
-    looked_s: Floats, before: Floats, stream_set: Ints, first: Ints, first_stage: Ints, serves: Bools, moves: Floats,
+    set_junction: Ints, gives_way: Bools, partly: Bools, memory_s: Floats, forget_s: Floats, share: Floats,
+    stood_s: Floats, queued: Bools, looked_s: Floats, before: Floats, stream_set: Ints, first: Ints, first_stage: Ints,
+    serves: Bools, moves: Floats,
 ) -> None:  # fmt: skip
     for lane_set, junction in enumerate(set_junction):
         if not asked[junction]:
             continue
         row, since_s = present[junction], time_s - looked_s[junction]
         for stage in range(first_stage[junction], first_stage[junction + 1]):
-            share[stage, lane_set] += min(since_s / FORGET_S, 1.0) * (1 - share[stage, lane_set])
+            share[stage, lane_set] += min(since_s / forget_s[stage, lane_set], 1.0) * (1 - share[stage, lane_set])
         if gives_way[row, lane_set] and queued[lane_set] and looked_s[junction] >= begin_s[junction] + START_S:
             gone = (left[lane_set] - before[lane_set]) / (flow[lane_set] * since_s)
-            now = share[row, lane_set] + min(since_s / MEMORY_S, 1.0) * (gone - share[row, lane_set])
+            now = share[row, lane_set] + min(since_s / memory_s[row, lane_set], 1.0) * (gone - share[row, lane_set])
             share[row, lane_set] = min(max(now, LEAST_SHARE), 1.0)
         if left[lane_set] > before[lane_set] or near[lane_set] < 1:
             stood_s[lane_set] = 0.0
