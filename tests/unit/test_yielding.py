@@ -90,7 +90,7 @@ def test_who_never_has_a_stage_alone_is_left_as_it_is(make: Make, street_of: Str
     assert left_turns(street_of(make)) == []
 
 
-def test_lanes_that_give_way_to_who_walks_have_what_they_had_on_average_while_he_is_cleared_too(
+def test_left_turns_among_people_have_what_they_had_on_average_also_while_who_walks_is_cleared(
     street_of: StreetOf,
 ) -> None:
     network = street_of(odd_nets.pedestrians)

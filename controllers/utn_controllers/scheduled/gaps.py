@@ -21,8 +21,7 @@ lane waits. Elsewhere it was found to do harm: a green that ends the sooner cost
 Where the road that he goes onto leads to another signal a few metres on, of the same junction or not, and that has red,
 nobody finds a gap: the first stands amid the junction until a stage lets him off it, and has left his lane (within.py).
 
-Where another stage of the junction has a lane set to itself, and where people walk, yielding.py has learnt what it
-does.
+Where another stage of the junction has a lane set to itself, or people walk, yielding.py has learnt what it does.
 """
 
 from __future__ import annotations

@@ -3,10 +3,10 @@
 A left turn that waits for gaps in what comes towards it hardly moves while that has a queue. Where another stage has
 it to itself, that one is to be shown in time.
 
-A lane of which some turn over a road on which people walk goes all green long at a third or a half of what it could,
-and while who walks is cleared too. Left turns among them find more gaps than what comes towards them would leave by
-itself, which is held up as well, and who found one may have to wait again. Taken to go fast as a green begins and to
-stand when some wait (gaps.py), such lanes would have another green whenever they stand, with all that clearances take.
+A lane from which some turn in such gaps, over a road on which people walk, goes all green long at a third or a half of
+what it could, and while who walks is cleared too: what comes towards it is held up as well, so that there are more gaps
+than it would leave by itself, and who found one may have to wait again. Taken to go fast as a green begins and to stand
+when some wait (gaps.py), it would have another green whenever it stands, with all that clearances take.
 
 And who has green does not go at all while the first of his lane has red. Where a stage serves a part of a lane set and
 nobody of its queue has gone for a while, in one green or in several short ones, somebody of the other part is in front:
@@ -20,13 +20,13 @@ import numpy as np
 from utn_controllers.scheduled.moves import Moves
 from utn_controllers.scheduled.standstill import START_S, Shown
 from utn_controllers.scheduled.streams import Streams
-from utn_sumo.clearances import GIVES_WAY, GREEN
+from utn_sumo.clearances import GIVES_WAY, GREEN, HAS_WAY
 from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
 MEMORY_S, WALKED_MEMORY_S = 10.0, 120.0
-"""Over how much green before a queue its flow is taken, and that of lanes that who walks holds up: theirs is what
-they have on average, whoever is in front."""
+"""Over how much green before a queue its flow is taken, and that of lanes that who walks holds up besides: theirs
+is what they have on average, whoever is in front."""
 FORGET_S, WALKED_FORGET_S = 300.0, 900.0
 """Over how long what it was is forgotten, and the whole discharge expected again."""
 LEAST_SHARE = 0.05
@@ -44,7 +44,7 @@ class Yielding:
         in_part = _give_way(network, streams)
         among = _among_walkers(network, streams) & ~in_part
         self.learnt = in_part | among
-        """(S, L) lane sets that must give way in a stage, and not in another one or to who walks."""
+        """(S, L) lane sets that must give way in a stage, and not in another one or to who walks besides."""
         self._memory_s = np.where(among, WALKED_MEMORY_S, MEMORY_S)
         self._forget_s = np.where(among, WALKED_FORGET_S, FORGET_S)
         self._cleared = _cleared(streams, moves, among)
@@ -97,15 +97,17 @@ def _give_way(network: Network, streams: Streams) -> Bools:
 
 
 def _among_walkers(network: Network, streams: Streams) -> Bools:
-    """(S, L) lane sets of which somebody gives way in a stage in which people walk."""
+    """(S, L) lane sets of which somebody gives way to other traffic in a stage in which people walk."""
     found = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=np.bool_)
     for row, stage in enumerate(streams.stage):
         junction, state = network.junctions[network.stage_junction[stage]], network.stages[stage].state
         letters = zip(state, junction.signal_turns, junction.conflicts, strict=True)
-        if any(shown in GREEN and not turns and any(conflicts) for shown, turns, conflicts in letters):
-            for stream in np.flatnonzero(streams.serves[row]):
-                gives_way = any(state[letter] == GIVES_WAY for letter in streams.letters[stream])
-                found[row, streams.lane_set[stream]] |= gives_way
+        if not any(shown in GREEN and not turns and any(conflicts) for shown, turns, conflicts in letters):
+            continue
+        having = [letter for letter, turns in enumerate(junction.signal_turns) if turns and state[letter] == HAS_WAY]
+        for stream in np.flatnonzero(streams.serves[row]):
+            giving = (letter for letter in streams.letters[stream] if state[letter] == GIVES_WAY)
+            found[row, streams.lane_set[stream]] |= any(junction.conflicts[a][b] for a in giving for b in having)
     return found
 
 
