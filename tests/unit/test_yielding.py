@@ -115,7 +115,10 @@ def test_left_turns_among_people_have_what_they_had_on_average_also_while_who_wa
         shares.append(float(moves[row, own]))
         left_veh[lane_set] += 10 * 0.3 * network.set_saturation_flow_veh_s[lane_set] * (second % 10 == 8)
     assert shares[0] == 1.0
-    assert np.array(shares[150:]) == pytest.approx(0.3, abs=0.1)
+    # It is forgotten a little meanwhile.
+    late = np.array(shares[250:])
+    assert 0.3 < late.min() < late.max() < 0.45
+    assert np.ptp(late) < 0.05
     assert moves[cleared, own] == pytest.approx(before[:, own] * shares[-1])
     others = np.flatnonzero(~np.isin(np.arange(moves.shape[1]), own) & ~learning.learnt[row, streams.lane_set])
     assert (moves[cleared][:, others] == before[:, others]).all()
