@@ -15,10 +15,8 @@ from scipy.optimize import linprog
 
 from tests.integration import odd_nets
 from tests.unit.views import by_the_line, scene
-from utn_controllers.scheduled.ending import are_alone
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.gaps import AMID_VEH, GAP_S, HEADWAY_S, Gaps, Giving, clear, headways, let_go
-from utn_controllers.scheduled.moves import Moves
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.contract import Network
@@ -175,13 +173,7 @@ def test_nobody_waits_for_gaps_on_lanes_from_which_hardly_anybody_turns(street_o
 
 def test_nobody_counts_as_gone_with_his_green_where_he_goes_on_while_who_walks_is_cleared(street_of: StreetOf) -> None:
     for make, goes_on in ((odd_nets.pedestrians, True), (odd_nets.plain, False)):
-        network = street_of(make)
-        streams = Streams(network)
-        learnt = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=bool)
-        held = Moves(network, streams, 2, are_alone(network, streams)).held
-        giving = Giving(network, streams, learnt, 2.0, held, np.array([4]))
-        giving.take_up(streams.shares(network.fraction))
-        gaps = giving.gaps
+        gaps = Scheduled(street_of(make))._giving.gaps
         assert (gaps.waiting > 0).any()
         assert (gaps.amid_veh[gaps.waiting > 0] == (0.0 if goes_on else AMID_VEH)).all()
 

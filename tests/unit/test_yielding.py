@@ -75,17 +75,26 @@ def test_left_turns_in_pockets_with_arrows_give_way_and_have_a_stage_of_their_ow
     assert all(len(arrows.groups[group].lanes) == 1 for group in groups)
 
 
-def walked_alone(folder: Path) -> Path:
-    """Left turns give way to other traffic, and whoever walks has green for himself."""
-    net = odd_nets.row("C").net(folder, odd_nets.NO_TURNAROUNDS, "--sidewalks.guess", "--crossings.guess")
-    cars, phases = ("GGgrrrGGgrrr", "rrrGGgrrrGGg"), []
-    for green in cars:
-        phases += [(20, green + "rrrr"), (3, green.replace("G", "y").replace("g", "y") + "rrrr")]
-    odd_nets.retime(net, odd_nets.tl_logic("C", [*phases, (10, "r" * 12 + "GGGG"), (5, "r" * 16)]))
+def among_people(folder: Path) -> Path:
+    """Two lanes a road, left turns from the inner one in gaps of their opposites, and people walk meanwhile."""
+    odd_nets.row("C", lanes=2).net(folder, odd_nets.NO_TURNAROUNDS, "--sidewalks.guess", "--crossings.guess")
     return odd_nets.case(folder, odd_nets.traffic("C") + odd_nets.walkers("W-C", "C-E"))
 
 
-@pytest.mark.parametrize("make", [odd_nets.plain, walked_alone])
+def beside_people(folder: Path) -> Path:
+    """The same, but whoever walks has green for himself."""
+    case = among_people(folder)
+    phases = [
+        phase
+        for green in ("gGGgrrrrgGGgrrrr", "rrrrgGGgrrrrgGGg")
+        for phase in ((20, green + "rrrr"), (3, green.replace("G", "y").replace("g", "y") + "rrrr"))
+    ]
+    logic = odd_nets.tl_logic("C", [*phases, (10, "r" * 16 + "GGGG"), (5, "r" * 20)])
+    odd_nets.retime(next(folder.glob("*.net.xml")), logic)
+    return case
+
+
+@pytest.mark.parametrize("make", [odd_nets.plain, odd_nets.pedestrians, odd_nets.two_lanes, beside_people])
 def test_who_never_has_a_stage_alone_is_left_as_it_is(make: Make, street_of: StreetOf) -> None:
     assert left_turns(street_of(make)) == []
 
@@ -93,12 +102,13 @@ def test_who_never_has_a_stage_alone_is_left_as_it_is(make: Make, street_of: Str
 def test_left_turns_among_people_have_what_they_had_on_average_also_while_who_walks_is_cleared(
     street_of: StreetOf,
 ) -> None:
-    network = street_of(odd_nets.pedestrians)
+    network = street_of(among_people)
     streams = Streams(network)
     all_moves = Moves(network, streams, 2, are_alone(network, streams))
     learning, moves = Yielding(network, streams, all_moves), all_moves.share
     rows, sets = learning.learnt.nonzero()
-    assert sorted(sets.tolist()) == list(range(len(network.lane_sets)))
+    # Of each road the inner of two lanes.
+    assert sorted(network.set_link[sets].tolist()) == list(range(4))
     # Nobody is thought to wait for gaps besides.
     assert not Scheduled(network)._giving.gaps.some.any()
     row, lane_set = int(rows[0]), int(sets[0])

@@ -3,10 +3,11 @@
 A left turn that waits for gaps in what comes towards it hardly moves while that has a queue. Where another stage has
 it to itself, that one is to be shown in time.
 
-A lane from which some turn in such gaps, over a road on which people walk, goes all green long at a third or a half of
-what it could, and while who walks is cleared too: what comes towards it is held up as well, so that there are more gaps
-than it would leave by itself, and who found one may have to wait again. Taken to go fast as a green begins and to stand
-when some wait (gaps.py), it would have another green whenever it stands, with all that clearances take.
+A lane with others beside it, from which some turn in such gaps over a road on which people walk, goes all green long at
+a third or a half of what it could, and while who walks is cleared too: what comes towards it is held up as well, so
+that there are more gaps than it would leave by itself, and who found one may have to wait again. Taken to go fast as a
+green begins and to stand when some wait (gaps.py), it would have another green whenever it stands, with all that
+clearances take.
 
 And who has green does not go at all while the first of his lane has red. Where a stage serves a part of a lane set and
 nobody of its queue has gone for a while, in one green or in several short ones, somebody of the other part is in front:
@@ -97,7 +98,11 @@ def _give_way(network: Network, streams: Streams) -> Bools:
 
 
 def _among_walkers(network: Network, streams: Streams) -> Bools:
-    """(S, L) lane sets of which somebody gives way to other traffic in a stage in which people walk."""
+    """(S, L) lane sets with others beside them of which somebody gives way to other traffic while people walk.
+
+    Of a single lane all wait for the first: it goes as gaps.py has it.
+    """
+    beside = np.bincount(network.set_link, minlength=len(network.links)) > 1
     found = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=np.bool_)
     for row, stage in enumerate(streams.stage):
         junction, state = network.junctions[network.stage_junction[stage]], network.stages[stage].state
@@ -105,7 +110,7 @@ def _among_walkers(network: Network, streams: Streams) -> Bools:
         if not any(shown in GREEN and not turns and any(conflicts) for shown, turns, conflicts in letters):
             continue
         having = [letter for letter, turns in enumerate(junction.signal_turns) if turns and state[letter] == HAS_WAY]
-        for stream in np.flatnonzero(streams.serves[row]):
+        for stream in np.flatnonzero(streams.serves[row] & beside[streams.link]):
             giving = (letter for letter in streams.letters[stream] if state[letter] == GIVES_WAY)
             found[row, streams.lane_set[stream]] |= any(junction.conflicts[a][b] for a in giving for b in having)
     return found
