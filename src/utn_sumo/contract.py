@@ -174,10 +174,15 @@ class Junction:
     """In the order of their letters."""
 
     @property
+    def crossings(self) -> tuple[int, ...]:
+        """Letters of streams that no motor traffic is part of and that cross others: people walk there."""
+        letters = enumerate(zip(self.signal_turns, self.conflicts, strict=True))
+        return tuple(letter for letter, (turns, conflicts) in letters if not turns and any(conflicts))
+
+    @property
     def is_walked(self) -> bool:
-        """Whether streams that no motor traffic is part of cross others: people walk here."""
-        letters = zip(self.signal_turns, self.conflicts, strict=True)
-        return any(not turns and any(conflicts) for turns, conflicts in letters)
+        """Whether people walk here."""
+        return len(self.crossings) > 0
 
 
 @dataclass(frozen=True)

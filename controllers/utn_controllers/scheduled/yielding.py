@@ -106,8 +106,7 @@ def _among_walkers(network: Network, streams: Streams) -> Bools:
     found = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=np.bool_)
     for row, stage in enumerate(streams.stage):
         junction, state = network.junctions[network.stage_junction[stage]], network.stages[stage].state
-        letters = zip(state, junction.signal_turns, junction.conflicts, strict=True)
-        if not any(shown in GREEN and not turns and any(conflicts) for shown, turns, conflicts in letters):
+        if not any(state[letter] in GREEN for letter in junction.crossings):
             continue
         having = [letter for letter, turns in enumerate(junction.signal_turns) if turns and state[letter] == HAS_WAY]
         for stream in np.flatnonzero(streams.serves[row] & beside[streams.link]):
