@@ -135,10 +135,10 @@ def test_streams_of_motor_traffic_keep_their_places_and_their_greens(street_of: 
         asked = {letter for own_letters in calling.letters[first + own[junction] : last] for letter in own_letters}
         assert asked <= {caller.letter for caller in network.junctions[junction].callers}
     rng = np.random.default_rng(1)
-    stand, worth, ends, most = rng.random((4, len(streams.link)))
+    stand, worth, ends, kept, most = rng.random((5, len(streams.link)))
     come, pressed = rng.random((len(streams.link), 5)), rng.integers(0, 3, len(network.callers)).astype(float)
     waiting = rng.random(len(sides))
-    joined = calling.join(pressed, waiting, np.full(len(network.junctions), 5.0), stand, come, worth, ends, most)
-    for whole, part in zip(joined, (stand, come, worth, ends, most), strict=True):
+    joined = calling.join(pressed, waiting, np.full(len(network.junctions), 5.0), stand, come, worth, ends, kept, most)
+    for whole, part in zip(joined, (stand, come, worth, ends, kept, most), strict=True):
         assert (whole[calling.motors] == part).all()
     assert joined[0].sum() == pytest.approx(stand.sum() + pressed.sum() + waiting.sum())

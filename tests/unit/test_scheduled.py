@@ -61,8 +61,12 @@ class Crossing:
     """Bins that who is left at the end waits longer."""
     needing: tuple[float, ...] = ()
     """(N,) what each of these weighs beside that: else nothing."""
+    kept: float = 1.0
+    """What one weighs who is left with green, over what he does without."""
     then: int = field(default=-1, init=False)
     """The stage led to in the bin after that of the last decision, as it foresaw."""
+    last: int = field(default=-1, init=False)
+    """The row that the schedule of the last decision ends with."""
 
     def green(self) -> Floats:
         """(S, N) share of its discharge that each stream has in each stage."""
@@ -143,6 +147,7 @@ class Crossing:
         stages = len(self.clearance)
         plan = np.zeros(self.bins, dtype=np.int64) if plan is None else plan
         sent = np.zeros((stages, self.bins)) if sent is None else sent.copy()
+        shown = plan[None].copy()
         wish, then = schedules(
             np.array([stage]),
             np.array([free]),
@@ -152,12 +157,13 @@ class Crossing:
             np.zeros((stages, self.bins)) if come is None else come,
             np.zeros(stages) + np.array(worth, dtype=float),
             self.ends(worth),
+            self.kept * self.ends(worth),
             np.zeros(stages) + np.array(most, dtype=float),
-            plan[None].copy(),
+            shown,
             sent,
         )
         assert wish[0] in (stage, then[0])
-        self.then = int(then[0])
+        self.then, self.last = int(then[0]), int(shown[0, -1])
         return int(wish[0]), sent
 
     def begins(self, stand: object, come: Floats, most: object = 1.0) -> list[tuple[int, int, Floats]]:
@@ -205,15 +211,26 @@ def waited(shown: list[int], drawn: Drawn) -> float:
         for stage, arriving in zip(shown, come[stream], strict=True):
             queue = max(queue + arriving - (most if stage == stream else 0.0), 0.0)
             total += worth[stream] * queue
-        total += crossing.ends(worth)[stream] * queue
+        total += crossing.ends(worth)[stream] * queue * (crossing.kept if shown[-1] == stream else 1.0)
     return total
 
 
-def a_bin(green: Floats, place: int, queue: Floats, drawn: Drawn) -> tuple[float, Floats]:
-    """What is waited in a bin of which streams have the share `green`; the queues."""
+def foreseen(drawn: Drawn, sent: Floats) -> float:
+    """The same by the schedule of the last decision, which sends off so many."""
+    crossing, stand, come, worth, _ = drawn
+    left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
+    ends = crossing.ends(worth)
+    if 0 <= crossing.last < len(stand):
+        ends[crossing.green()[crossing.last] > 0] *= crossing.kept
+    return float(np.array(worth) @ left_veh.sum(axis=1) + ends @ left_veh[:, -1])
+
+
+def a_bin(green: Floats, place: int, queue: Floats, drawn: Drawn, *, clears: bool) -> tuple[float, Floats]:
+    """What is waited in a bin, of a clearance or not, of which streams have the share `green`; the queues."""
     crossing, _, come, worth, most = drawn
     queue = np.maximum(queue + np.array(come)[:, place] - green * most, 0.0)
-    weights = np.array(worth) + crossing.ends(worth) * (place == len(come[0]) - 1)
+    ends = crossing.ends(worth) * np.where((green > 0) & (not clears), crossing.kept, 1.0)
+    weights = np.array(worth) + ends * (place == len(come[0]) - 1)
     return float(weights @ queue), queue
 
 
@@ -237,14 +254,14 @@ def plainly(drawn: Drawn, rest: int) -> tuple[set[int], float]:
                         continue
                     until, cleared, opens = spent, queue, now
                     for still in crossing.cleared(stage, other)[: bins - now]:
-                        cost, cleared = a_bin(still, opens, cleared, drawn)
+                        cost, cleared = a_bin(still, opens, cleared, drawn, clears=True)
                         until, opens = until + cost, opens + 1
                     weights = (bins - opens) * np.array(drawn[3]) + crossing.ends(drawn[3]) * (opens < bins)
                     stayed = until + float((weights * (green[other] == 0)) @ cleared)
                     if stayed < states.get((opens, other), (np.inf,))[-1] - 1e-9:
                         states[opens, other] = until, cleared, other if now == 0 else first, stayed
             if now < last:
-                cost, queue = a_bin(green[stage], now, queue, drawn)
+                cost, queue = a_bin(green[stage], now, queue, drawn, clears=False)
                 spent += cost
     ends += [(cost, first) for (begin, _), (cost, _, first, _) in states.items() if begin == bins]
     least = min(ends, key=lambda end: end[0])[0]
@@ -261,7 +278,8 @@ def junctions(draw: st.DrawFn, stages: int = 2) -> Drawn:
     few = lists(st.integers(1, 2), stages).map(tuple)
     longer = draw(st.sampled_from([0.0, 5.0, 20.0]))
     needed = tuple(draw(lists(st.sampled_from([0.0, 3.0, 12.0]), stages)))
-    crossing = Crossing(draw(few), draw(few), draw(st.integers(8, 10)), staying=longer, needing=needed)
+    kept = draw(st.sampled_from([1.0, 0.8]))
+    crossing = Crossing(draw(few), draw(few), draw(st.integers(8, 10)), staying=longer, needing=needed, kept=kept)
     veh = st.integers(0, 24).map(lambda quarters: quarters / 4)
     share = st.sampled_from([0.0, 0.0, 0.0, 0.25, 0.5, 1.0, 2.0])
     come = draw(lists(lists(share, crossing.bins), stages))
@@ -302,8 +320,7 @@ class TestProgramme:
         every = [(waited(shown, drawn), shown) for shown in every_sequence(crossing)]
         best = min(cost for cost, _ in every)
         begun_so = min(cost for cost, shown in every if (shown[0] == 0) == (wish == 0))
-        left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
-        planned = float(np.array(worth) @ left_veh.sum(axis=1) + crossing.ends(worth) @ left_veh[:, -1])
+        planned = foreseen(drawn, sent)
         assert best - 1e-6 <= planned <= NEAR_ENOUGH * best + 1e-6
         assert begun_so <= NEAR_ENOUGH * best + 1e-6
 
@@ -346,8 +363,7 @@ class TestProgramme:
         assume(sum(stand[1:]) + np.sum(come[1:]) > 0)
         wish, sent = crossing.decide(stand, np.array(come), rest=rest, worth=worth, most=most)
         found, cost = plainly(drawn, rest)
-        left_veh = np.array(stand)[:, None] + np.cumsum(np.array(come) - sent, axis=1)
-        planned = float(np.array(worth) @ left_veh.sum(axis=1) + crossing.ends(worth) @ left_veh[:, -1])
+        planned = foreseen(drawn, sent)
         assert wish in found
         assert planned == pytest.approx(cost, abs=1e-6)
 
@@ -362,6 +378,17 @@ class TestProgramme:
         shown = [stage for _, stage, _ in ended]
         assert len(shown) > 20
         assert all(set(shown[place : place + 6]) == {0, 1, 2} for place in range(len(shown) - 6))
+
+    @pytest.mark.parametrize("queue", [8.0, 12.0])
+    def test_a_green_goes_on_before_a_longer_queue_where_who_is_left_with_green_waits_less(self, queue: float) -> None:
+        # One clearance in any case, and the other road is worth a little more.
+        stand, worth = [queue, 20.0], [1.0, 1.05]
+        crossing = Crossing(bins=16, staying=60.0)
+        assert crossing.decide(stand, worth=worth)[0] == 1
+        kept = replace(crossing, kept=0.9)
+        assert kept.decide(stand, worth=worth)[0] == 0
+        # Green is not as good as that for who waits for gaps in it.
+        assert replace(kept, waits={(1, 1): 0.2}).decide(stand, worth=worth)[0] == 1
 
     def test_with_nobody_anywhere_the_present_stage_stays(self) -> None:
         for stage in range(3):
@@ -582,9 +609,9 @@ class TestEnding:
             lost_bins = lost(streams.first_stage, times * clearance)
             ending = Ending(streams, lost_bins, np.full(8, 25), np.ones(8, dtype=bool))
             everywhere = np.ones(8, dtype=bool)
-            assert not ending.weights(everywhere, none, none, nobody).any()
+            assert not np.any(ending.weights(everywhere, none, none, nobody))
             ending.take_up(come, np.ones(len(come)), np.ones(len(come)))
-            needed.append(ending.weights(everywhere, none, none, nobody))
+            needed.append(ending.weights(everywhere, none, none, nobody)[0])
         assert not needed[0].any()
         assert needed[1].any()
         assert (needed[2][needed[1] > 0] > needed[1][needed[1] > 0]).all()
@@ -646,10 +673,16 @@ class TestEnding:
             ending = Ending(streams, np.full(junctions, 4), np.full(junctions, 25), alone)
             ending.take_up(np.full(count, 0.2), np.ones(count), np.ones(count))
             few, many, all_ = np.zeros(count), np.full(count, 90.0), np.ones(junctions, dtype=bool)
-            quiet = ending.weights(all_, few, few, np.zeros((count, 25)))
-            busy = ending.weights(all_, few, many, np.zeros((count, 25)))
+            quiet, quiet_open = ending.weights(all_, few, few, np.zeros((count, 25)))
+            busy, busy_open = ending.weights(all_, few, many, np.zeros((count, 25)))
             assert (busy > quiet).any() == alone.any()
-            assert (ending.weights(~all_, few, many, np.zeros((count, 25))) == quiet).all()
+            # Not quite as long for who has green at the end, where any wait longer at all.
+            assert (quiet_open == quiet).all()
+            assert ((busy_open < busy) == (busy > quiet)).all()
+            assert (busy_open >= quiet).all()
+            others, others_open = ending.weights(~all_, few, many, np.zeros((count, 25)))
+            assert (others == quiet).all()
+            assert (others_open == quiet).all()
 
     @given(st.data())
     def test_the_greens_that_all_need_are_enough_and_least_where_no_two_stages_share(self, data: st.DataObject) -> None:

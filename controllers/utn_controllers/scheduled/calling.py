@@ -66,18 +66,19 @@ class Calling:
         come: Floats,
         worth: Floats,
         ends: Floats,
+        kept: Floats,
         most: Floats,
-    ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """`stand`, `come`, `worth`, `ends` and `most` of all streams, by those of motor traffic.
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+        """`stand`, `come`, `worth`, `ends`, `kept` and `most` of all streams, by those of motor traffic.
 
         And by how many buttons of each caller are pressed, `calling` (C,), and how many are `waiting` (E,) on side
         roads; who is left at the end of a schedule stays there for so many bins, `staying` (J,).
         """
         if not self._is_joined:
-            return stand, come, worth, ends, most
-        joined: tuple[Floats, Floats, Floats, Floats, Floats] = _joined(
+            return stand, come, worth, ends, kept, most
+        joined: tuple[Floats, Floats, Floats, Floats, Floats, Floats] = _joined(
             *self._places, *self._junctions, self._stream, self._most, calling, waiting, staying,
-            stand, come, worth, ends, most,
+            stand, come, worth, ends, kept, most,
         )  # fmt: skip
         return joined
 
@@ -86,21 +87,22 @@ class Calling:
 def _joined(
     motors: Ints, called: Ints, beside: Ints, called_at: Ints, beside_at: Ints, stream: Ints, beside_most: Floats,
     calling: Floats, waiting: Floats, staying: Floats,
-    stand: Floats, come: Floats, worth: Floats, ends: Floats, most: Floats,
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:  # fmt: skip
+    stand: Floats, come: Floats, worth: Floats, ends: Floats, kept: Floats, most: Floats,
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:  # fmt: skip
     every = len(motors) + len(called) + len(beside)
-    all_stand, all_worth, all_ends, all_most = np.zeros(every), np.zeros(every), np.zeros(every), np.zeros(every)
+    all_stand, all_worth, all_ends, all_kept, all_most = np.zeros((5, every))
     all_come = np.zeros((every, come.shape[1]))
     for own, place in enumerate(motors):
         all_stand[place], all_come[place] = stand[own], come[own]
-        all_worth[place], all_ends[place], all_most[place] = worth[own], ends[own], most[own]
+        all_worth[place], all_most[place] = worth[own], most[own]
+        all_ends[place], all_kept[place] = ends[own], kept[own]
     for caller, pressed in enumerate(calling):
         all_stand[called[stream[caller]]] += pressed
     for own, place in enumerate(called):
         all_worth[place], all_most[place] = PRESSED_VEH, ALL
-        all_ends[place] = PRESSED_VEH * staying[called_at[own]]
+        all_ends[place] = all_kept[place] = PRESSED_VEH * staying[called_at[own]]
     # A side road's weigh as before an empty road: how full theirs is, nothing says.
     for own, place in enumerate(beside):
         all_stand[place], all_worth[place], all_most[place] = waiting[own], 1.0, beside_most[own]
-        all_ends[place] = staying[beside_at[own]]
-    return all_stand, all_come, all_worth, all_ends, all_most
+        all_ends[place] = all_kept[place] = staying[beside_at[own]]
+    return all_stand, all_come, all_worth, all_ends, all_kept, all_most

@@ -10,6 +10,10 @@ every other cycle, and have its queue wait twice as long for a second or two of 
 At a junction alone where more are there and will come than can go in a schedule, all who come until they have gone wait
 for as long as it takes to let one more go. At capacity that is long, and a schedule that did not count it would change
 its stages as if there were time to spare: those of many lanes again and again, while the queue of a single lane grows.
+
+Not quite as long if he has green at the end: he goes without another clearance, and the longer greens last, the fewer
+there are of these. Else it would be all the same when a schedule changes from one long queue to another, since that
+costs it one clearance in any case, and whichever road is a little fuller would have green too soon.
 """
 
 from __future__ import annotations
@@ -28,6 +32,8 @@ NEEDING_OF_STAYING = 1.4
 """So many times as long as he waits longer than that have others to wait who come while he is let go."""
 MOST_LOAD, LONGEST_BUSY_BINS = 0.9, 150.0
 """With a greater load a junction would be busy for ever: it is taken for no more, and for so long at most."""
+OPEN = 0.9
+"""So many times as long all wait for who is left with green."""
 LEAST_LOAD, NONE_BINS = 1e-6, 1e-9
 """Who hardly comes needs some green too; green that is none."""
 
@@ -63,20 +69,22 @@ class Ending:
             serves = streams.serves[slice(*streams.first_stage[junction : junction + 2]), own]
             self._needing[own] = weight * needing(serves, come_veh[own], most_veh[own])
 
-    def weights(self, asked: Bools, worth: Floats, stand: Floats, come: Floats) -> Floats:
+    def weights(self, asked: Bools, worth: Floats, stand: Floats, come: Floats) -> tuple[Floats, Floats]:
         """(N,) what a vehicle weighs that is left before junctions `asked` (J,), by what it is worth in a bin.
+
+        And (N,) one that has green then, and goes freely.
 
         `stand` (N,), `come` (N, K) vehicles as of `schedules`.
         """
         ends = worth * self._staying + self._needing
         if not self._alone.any():
-            return np.asarray(ends)
+            return ends, ends
         streams = self._streams
         longer = prices(
             asked & self._alone, self._ahead_bins, self._lost_bins, streams.first, streams.first_stage, streams.serves,
             streams.lane_set, self._come, self._lanes, stand, come,
         )  # fmt: skip
-        return np.asarray(ends + longer)
+        return ends + longer, ends + OPEN * longer
 
 
 @compiled

@@ -148,14 +148,14 @@ class Scheduled:
         else:
             rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
             rest = np.clip(rest_s / BIN_S, 0, self._plan.shape[1]).astype(np.int64)
-        ends = self._ending.weights(view.free, worth, stand, come)
+        ends, kept = self._ending.weights(view.free, worth, stand, come)
         waiting = self._sides.look(view, present)
         wish, then = schedules(
             view.stage,
             view.free,
             rest,
             self._rules,
-            *self._calling.join(view.calling, waiting, self._ending.staying_bins, stand, come, worth, ends, most),
+            *self._calling.join(view.calling, waiting, self._ending.staying_bins, stand, come, worth, ends, kept, most),
             self._plan,
             self._sent_veh,
         )

@@ -32,14 +32,15 @@ ALIKE = 1e-9
 @compiled
 def schedules(
     stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats, ends: Floats,
-    most: Floats, plan: Ints, sent: Floats,
+    kept: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> tuple[Ints, Ints]:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
     And (J,) the same of the next bin, as far as it is foreseen.
 
     `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
-    weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `most` (N,) that leave in a bin of green.
+    weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `kept` (N,) of one that has green then
+    and waits for no gaps, `most` (N,) that leave in a bin of green.
 
     Of K bins schedules have as many as the rules say; beyond these `plan` has -1 and `sent` nobody.
 
@@ -64,12 +65,12 @@ def schedules(
         if rules.gaps.some[low : low + stages].any():
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, rules.gaps, stand[a:b], come[a:b, :bins].copy(),
-                worth[a:b], ends[a:b], most[a:b], plan[junction, :bins], goes,
+                worth[a:b], ends[a:b], kept[a:b], most[a:b], plan[junction, :bins], goes,
             )  # fmt: skip
         else:
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, None, stand[a:b], come[a:b, :bins].copy(), worth[a:b],
-                ends[a:b], most[a:b], plan[junction, :bins], goes,
+                ends[a:b], kept[a:b], most[a:b], plan[junction, :bins], goes,
             )  # fmt: skip
         sent[a:b, :bins] = goes
         wish[junction] = rules.stages[low + chosen]
@@ -85,7 +86,7 @@ def schedules(
 @compiled
 def _schedule(
     present: int, rest: int, low: int, stages: int, rules: Rules, gaps: Gaps | None, stand: Floats, come: Floats,
-    worth: Floats, ends: Floats, most: Floats, plan: Ints, sent: Floats,
+    worth: Floats, ends: Floats, kept: Floats, most: Floats, plan: Ints, sent: Floats,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on.
 
@@ -94,10 +95,10 @@ def _schedule(
     chosen = present
     called = _called(present, low, stages, rules, stand, come)
     if called.any():
-        traffic = _sums(rules.moves[low : low + stages], stand, come, worth, ends, most)
+        traffic = _sums(rules.moves[low : low + stages], stand, come, worth, ends, kept, most)
         # What was best a bin ago is seldom far from what is best now.
         _send_off(plan, rules, gaps, stand, come, most, sent)
-        known = _waited(sent, traffic)
+        known = _waited(sent, traffic, plan[-1], low, stages, rules)
         for limit in (known + ALIKE * (2 + known), NEVER):
             chosen = _search(present, rest, low, called, rules, gaps, traffic, limit, plan)
             if chosen >= 0:
@@ -257,7 +258,8 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 spent += left[stages] + due[stages, bins]
                 for place in range(greens):
                     stream = going[row, place]
-                    spent += ends[stream] * (veh[stream] - came[stream, bins])
+                    each = traffic.kept[stream] if gaps is None or gaps.waiting[row, stream] == 0 else ends[stream]
+                    spent += each * veh[stream] - ends[stream] * came[stream, bins]
                 if spent < best - ALIKE:
                     best, last_begin, last_stage = spent, begin, stage
     for stage in range(stages):
@@ -269,7 +271,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
 
 @compiled
 def _sums(
-    serves: Floats, stand: Floats, come: Floats, worth: Floats, ends: Floats, most: Floats
+    serves: Floats, stand: Floats, come: Floats, worth: Floats, ends: Floats, kept: Floats, most: Floats
 ) -> Traffic:  # fmt: skip
     """The traffic with what the costs of red are made of."""
     stages, (streams, bins) = len(serves), come.shape
@@ -286,7 +288,7 @@ def _sums(
     for stage in range(stages + 1):
         for place in range(bins):
             paid[stage, place + 1] = paid[stage, place] + grown[stage, place + 1]
-    return Traffic(stand, come, came, grown, paid, due, worth, ends, most)
+    return Traffic(stand, come, came, grown, paid, due, worth, ends, kept, most)
 
 
 @inlined
@@ -385,15 +387,16 @@ def _lead(
 
 
 @compiled
-def _waited(sent: Floats, traffic: Traffic) -> float:
-    """What is waited where so much is `sent` off (n, K)."""
-    total = 0.0
+def _waited(sent: Floats, traffic: Traffic, last: int, low: int, stages: int, rules: Rules) -> float:
+    """What is waited where so much is `sent` off (n, K) and the `last` row of the moves is shown at the end."""
+    total, green = 0.0, low <= last < low + stages
     for stream in range(len(sent)):
         veh, waited = traffic.stand[stream], 0.0
         for place in range(sent.shape[1]):
             veh += traffic.come[stream, place] - sent[stream, place]
             waited += veh
-        total += traffic.worth[stream] * waited + traffic.ends[stream] * veh
+        goes_on = green and rules.moves[last, stream] > 0 and rules.gaps.waiting[last, stream] == 0
+        total += traffic.worth[stream] * waited + (traffic.kept[stream] if goes_on else traffic.ends[stream]) * veh
     return total
 
 

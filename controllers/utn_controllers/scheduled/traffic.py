@@ -26,5 +26,7 @@ class Traffic(NamedTuple):
     """(n,) weight of a vehicle in a bin."""
     ends: Floats
     """(n,) weight of a vehicle that is left at the end."""
+    kept: Floats
+    """(n,) weight of one that has green then and waits for no gaps."""
     most: Floats
     """(n,) vehicles that leave in a bin of green."""
