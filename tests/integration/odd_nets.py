@@ -275,6 +275,20 @@ def bicycle_lanes(folder: Path) -> Path:
     return case(folder, bike + traffic("C") + "".join(riders))
 
 
+def arm_by_arm(folder: Path, *, main_every_s: float = 12, side_every_s: float = 24, end_s: int = 300) -> Path:
+    """A stage for each arm, of two lanes from the west and the east and one from the others."""
+    streets = row("C", lanes=2).without("nC-C", "sC-C")
+    for arm in ("nC", "sC"):
+        streets.one_way(arm, "C")
+    streets.net(folder, NO_TURNAROUNDS, "--tls.layout", "incoming")
+    ends = "W", "E", "nC", "sC"
+    ways = [(a, b, main_every_s if a in "WE" else side_every_s) for a in ends for b in ends if a != b]
+    flows = "".join(
+        flow(f"{a}_{b}", f"{a}-C", f"C-{b}", period=f"exp({1 / every_s:g})", end=end_s) for a, b, every_s in ways
+    )
+    return case(folder, flows, end=str(end_s))
+
+
 def one_road(folder: Path) -> Path:
     """A signal of one road alone, each of whose two turns has a lane and a stage of its own."""
     streets = Streets()

@@ -247,6 +247,19 @@ def waits_s(folder: Path, prefix: str) -> list[float]:
     return [float(trip["waitingTime"]) if float(trip["departDelay"]) < 60 else math.inf for trip in own]
 
 
+@pytest.mark.parametrize(("main_every_s", "side_every_s"), [(10, 40), (12, 20)])
+def test_far_over_capacity_each_arm_has_green_once_before_any_a_second_time(
+    main_every_s: float, side_every_s: float, tmp_path: Path
+) -> None:
+    file = odd_nets.arm_by_arm(tmp_path, main_every_s=main_every_s, side_every_s=side_every_s, end_s=1800)
+    result = bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / "out")
+    assert_safe(result)
+    states = monitor.read_switches(tmp_path / "out" / "signals.xml")["C"]
+    greens = [state for at_s, state in states if "G" in state and "y" not in state and at_s > 900]
+    assert len(greens) > 20
+    assert all(len(set(greens[place : place + 4])) == 4 for place in range(len(greens) - 3))
+
+
 @pytest.mark.parametrize("cars_every_s", [15, 5])
 def test_buses_with_a_stage_of_their_own_are_served_under_schedules(cars_every_s: float, tmp_path: Path) -> None:
     file = odd_nets.bus_stage(tmp_path, cars_every_s=cars_every_s, end_s=1200)

@@ -17,14 +17,24 @@ from scipy.optimize import linprog
 from tests.integration import odd_nets
 from tests.unit.views import Scene, by_the_line, scene
 from utn_controllers.recommended import Recommended
-from utn_controllers.scheduled.ending import Ending, ahead_bins, are_alone, greens, lost, needing, prices, staying
+from utn_controllers.scheduled.ending import (
+    Ending,
+    ahead_bins,
+    are_alone,
+    beyond,
+    greens,
+    lost,
+    needing,
+    prices,
+    staying,
+)
 from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.moves import Moves, Rules, going
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.worth import Worth
-from utn_sumo.contract import EXIT, ZONES_M, Floats, Ints, Network
+from utn_sumo.contract import EXIT, ZONES_M, Bools, Floats, Ints, Network
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.heads import Heads
 
@@ -142,8 +152,12 @@ class Crossing:
         free: bool = True,
         plan: Ints | None = None,
         sent: Floats | None = None,
+        shown_s: Sequence[float] | None = None,
     ) -> tuple[int, Floats]:
-        """The stage led to, and (N, K) what is sent off; `plan` (K,) is the schedule of the bin before."""
+        """The stage led to, and (N, K) what is sent off; `plan` (K,) is the schedule of the bin before.
+
+        By turns if it is said when stages were shown.
+        """
         stages = len(self.clearance)
         plan = np.zeros(self.bins, dtype=np.int64) if plan is None else plan
         sent = np.zeros((stages, self.bins)) if sent is None else sent.copy()
@@ -161,6 +175,8 @@ class Crossing:
             np.zeros(stages) + np.array(most, dtype=float),
             shown,
             sent,
+            np.array([shown_s is not None]),
+            np.zeros(stages) if shown_s is None else np.array(shown_s),
         )
         assert wish[0] in (stage, then[0])
         self.then, self.last = int(then[0]), int(shown[0, -1])
@@ -609,9 +625,10 @@ class TestEnding:
             lost_bins = lost(streams.first_stage, times * clearance)
             ending = Ending(streams, lost_bins, np.full(8, 25), np.ones(8, dtype=bool))
             everywhere = np.ones(8, dtype=bool)
-            assert not np.any(ending.weights(everywhere, none, none, nobody))
+            beyond_bins = ending.beyond_bins(everywhere, none, nobody)
+            assert not np.any(ending.weights(none, beyond_bins))
             ending.take_up(come, np.ones(len(come)), np.ones(len(come)))
-            needed.append(ending.weights(everywhere, none, none, nobody)[0])
+            needed.append(ending.weights(none, beyond_bins)[0])
         assert not needed[0].any()
         assert needed[1].any()
         assert (needed[2][needed[1] > 0] > needed[1][needed[1] > 0]).all()
@@ -624,13 +641,13 @@ class TestEnding:
         come = np.zeros((len(rate), 12))
         come[:, 9], come[:, 10] = come_veh, 100.0
         stages, streams = np.shape(serves)
-        return np.asarray(
-            prices(
-                np.ones(1, dtype=bool), np.array([10]), np.array([4]), np.array([0, streams]), np.array([0, stages]),
-                np.array(serves, dtype=bool), np.array(lane_set or range(streams)), np.array(rate), np.array(most),
-                np.array(stand), come,
-            )
+        first, first_stage, leaves = np.array([0, streams]), np.array([0, stages]), np.array(most)
+        own, lanes = np.array(serves, dtype=bool), np.array(lane_set or range(streams))
+        beyond_bins = beyond(
+            np.ones(1, dtype=bool), np.array([10]), np.array([4]), first, first_stage, own, lanes, leaves,
+            np.array(stand), come,
         )  # fmt: skip
+        return np.asarray(prices(beyond_bins, first, first_stage, own, lanes, np.array(rate), leaves))
 
     def test_where_more_are_there_than_can_go_all_who_come_wait_for_who_is_left(self) -> None:
         # Three lanes and one: five bins of green and ten, nine more than there are; a tenth of the time is spare.
@@ -673,14 +690,19 @@ class TestEnding:
             ending = Ending(streams, np.full(junctions, 4), np.full(junctions, 25), alone)
             ending.take_up(np.full(count, 0.2), np.ones(count), np.ones(count))
             few, many, all_ = np.zeros(count), np.full(count, 90.0), np.ones(junctions, dtype=bool)
-            quiet, quiet_open = ending.weights(all_, few, few, np.zeros((count, 25)))
-            busy, busy_open = ending.weights(all_, few, many, np.zeros((count, 25)))
+
+            def weights(asked: Bools, stand: Floats, ending: Ending = ending) -> tuple[Floats, Floats]:
+                come = np.zeros((len(stand), 25))
+                return ending.weights(np.zeros(len(stand)), ending.beyond_bins(asked, stand, come))
+
+            quiet, quiet_open = weights(all_, few)
+            busy, busy_open = weights(all_, many)
             assert (busy > quiet).any() == alone.any()
             # Not quite as long for who has green at the end, where any wait longer at all.
             assert (quiet_open == quiet).all()
             assert ((busy_open < busy) == (busy > quiet)).all()
             assert (busy_open >= quiet).all()
-            others, others_open = ending.weights(~all_, few, many, np.zeros((count, 25)))
+            others, others_open = weights(~all_, many)
             assert (others == quiet).all()
             assert (others_open == quiet).all()
 

@@ -14,6 +14,7 @@ calling.py      who walks, rides or takes a tram, and calls for green himself
 pockets.py      who is held up by a full pocket
 worth.py        what a vehicle's waiting weighs, and how many go where links are full
 ending.py       what it costs to leave somebody there at a schedule's end
+rounds.py       who comes next where far more are there than can go
 standstill.py   who has green and does not go
 traffic.py      what the programme has of those who stand and come
 programme.py    the dynamic programme of one junction

@@ -69,51 +69,78 @@ class Ending:
             serves = streams.serves[slice(*streams.first_stage[junction : junction + 2]), own]
             self._needing[own] = weight * needing(serves, come_veh[own], most_veh[own])
 
-    def weights(self, asked: Bools, worth: Floats, stand: Floats, come: Floats) -> tuple[Floats, Floats]:
-        """(N,) what a vehicle weighs that is left before junctions `asked` (J,), by what it is worth in a bin.
-
-        And (N,) one that has green then, and goes freely.
+    def beyond_bins(self, asked: Bools, stand: Floats, come: Floats) -> Floats:
+        """(J,) that those of `asked` (J,) that are alone need beyond their schedules to let all go; else none.
 
         `stand` (N,), `come` (N, K) vehicles as of `schedules`.
         """
-        ends = worth * self._staying + self._needing
         if not self._alone.any():
+            return np.zeros(len(asked))
+        streams = self._streams
+        return np.asarray(
+            beyond(
+                asked & self._alone, self._ahead_bins, self._lost_bins, streams.first, streams.first_stage,
+                streams.serves, streams.lane_set, self._lanes, stand, come,
+            )
+        )  # fmt: skip
+
+    def weights(self, worth: Floats, beyond_bins: Floats) -> tuple[Floats, Floats]:
+        """(N,) what a vehicle weighs that is left, by what it is worth in a bin and so many bins beyond schedules (J,).
+
+        And (N,) one that has green then, and goes freely.
+        """
+        ends = worth * self._staying + self._needing
+        if not beyond_bins.any():
             return ends, ends
         streams = self._streams
         longer = prices(
-            asked & self._alone, self._ahead_bins, self._lost_bins, streams.first, streams.first_stage, streams.serves,
-            streams.lane_set, self._come, self._lanes, stand, come,
-        )  # fmt: skip
+            beyond_bins, streams.first, streams.first_stage, streams.serves, streams.lane_set, self._come, self._lanes
+        )
         return ends + longer, ends + OPEN * longer
 
 
 @compiled
-def prices(
+def beyond(
     asked: Bools, ahead_bins: Ints, lost_bins: Ints, first: Ints, first_stage: Ints, serves: Bools, lane_set: Ints,
-    rate: Floats, most: Floats, stand: Floats, come: Floats,
+    most: Floats, stand: Floats, come: Floats,
 ) -> Floats:  # fmt: skip
-    """(N,) vehicles times bins that others wait longer for each that is left before a junction `asked` (J,).
+    """(J,) bins that junctions `asked` (J,) need beyond their schedules, until all have gone who are there or come.
 
-    A junction is busy beyond its schedule of `ahead_bins` (J,), of which clearances take `lost_bins` (J,) or more,
-    until all have gone who are there then or come meanwhile. Who comes until then waits for the time that one more of
-    a stream takes in its best stage: of those who go together there each lane set has its part of it, by their loads.
+    Of `ahead_bins` (J,) clearances take `lost_bins` (J,) or more. `serves` (S, N), `lane_set` (N,), vehicles that leave
+    its lanes at `most` (N,) in a bin, that `stand` (N,) and `come` (N, K).
+    """
+    found = np.zeros(len(asked))
+    for junction in range(len(asked)):
+        if asked[junction]:
+            a, b, ahead = first[junction], first[junction + 1], ahead_bins[junction]
+            own = serves[first_stage[junction] : first_stage[junction + 1], a:b]
+            work = (stand[a:b] + come[a:b, :ahead].sum(axis=1)) / most[a:b]
+            found[junction] = max(greens(own, _by_lanes(work, lane_set[a:b])) + lost_bins[junction] - ahead, 0.0)
+    return found
 
-    `serves` (S, N), `lane_set` (N,), vehicles that come of late at a `rate` (N,) and leave its lanes at `most` (N,) in
-    a bin, that `stand` (N,) and `come` (N, K).
+
+@compiled
+def prices(
+    beyond_bins: Floats, first: Ints, first_stage: Ints, serves: Bools, lane_set: Ints, rate: Floats, most: Floats
+) -> Floats:
+    """(N,) vehicles times bins that others wait longer for each that is left at a junction busy beyond its schedule.
+
+    It is so until all have gone who are there then or come meanwhile. Who comes until then waits for the time that one
+    more of a stream takes in its best stage: of those who go together there each lane set has its part of it, by their
+    loads.
+
+    `beyond_bins` (J,), `serves` (S, N), `lane_set` (N,), vehicles that come of late at a `rate` (N,) and leave its
+    lanes at `most` (N,) in a bin.
     """
     found = np.zeros(len(rate))
-    for junction in range(len(asked)):
-        if not asked[junction]:
+    for junction in range(len(beyond_bins)):
+        if beyond_bins[junction] <= 0:
             continue
         a, b = first[junction], first[junction + 1]
         own = serves[first_stage[junction] : first_stage[junction + 1], a:b]
-        work = (stand[a:b] + come[a:b, : ahead_bins[junction]].sum(axis=1)) / most[a:b]
-        beyond = greens(own, _by_lanes(work, lane_set[a:b])) + lost_bins[junction] - ahead_bins[junction]
-        if beyond <= 0:
-            continue
         load = np.maximum(rate[a:b] / most[a:b], LEAST_LOAD)
         loads = _by_lanes(load, lane_set[a:b])
-        busy = min(beyond / (1 - min(greens(own, loads), MOST_LOAD)), LONGEST_BUSY_BINS)
+        busy = min(beyond_bins[junction] / (1 - min(greens(own, loads), MOST_LOAD)), LONGEST_BUSY_BINS)
         for stream in range(b - a):
             part = np.inf
             for stage in range(len(own)):

@@ -15,6 +15,7 @@ from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.parked import Parked
 from utn_controllers.scheduled.programme import schedules
+from utn_controllers.scheduled.rounds import Rounds
 from utn_controllers.scheduled.sides import Sides
 from utn_controllers.scheduled.standstill import Standstill
 from utn_controllers.scheduled.streams import Streams
@@ -102,6 +103,7 @@ class Scheduled:
             self._giving.gaps,
         )
         self._ending = Ending(self._streams, lost_bins, ahead, alone)
+        self._rounds = Rounds(self._streams, self._rules.follows, ahead)
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules, of each junction as far as they go."""
         self._sent_veh = np.zeros((len(self._calling.letters), bins))
@@ -148,7 +150,9 @@ class Scheduled:
         else:
             rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
             rest = np.clip(rest_s / BIN_S, 0, self._plan.shape[1]).astype(np.int64)
-        ends, kept = self._ending.weights(view.free, worth, stand, come)
+        beyond_bins = self._ending.beyond_bins(view.free, stand, come)
+        ends, kept = self._ending.weights(worth, beyond_bins)
+        by_turns = self._rounds.look(view.time_s, present, beyond_bins)
         waiting = self._sides.look(view, present)
         wish, then = schedules(
             view.stage,
@@ -158,6 +162,8 @@ class Scheduled:
             *self._calling.join(view.calling, waiting, self._ending.staying_bins, stand, come, worth, ends, kept, most),
             self._plan,
             self._sent_veh,
+            by_turns,
+            self._rounds.shown_s,
         )
         outlook.sent_veh = self._sent_veh[self._calling.motors]
         self._due = [(index, int(then[index])) for index in (then != wish).nonzero()[0].tolist()]

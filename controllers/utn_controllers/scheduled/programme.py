@@ -15,6 +15,7 @@ import numpy as np
 
 from utn_controllers.scheduled.gaps import Gaps, begin_green, clear, let_go
 from utn_controllers.scheduled.moves import Rules
+from utn_controllers.scheduled.rounds import in_turn
 from utn_controllers.scheduled.traffic import Traffic
 from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import Bools, Floats, Ints
@@ -32,7 +33,7 @@ ALIKE = 1e-9
 @compiled
 def schedules(
     stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats, ends: Floats,
-    kept: Floats, most: Floats, plan: Ints, sent: Floats,
+    kept: Floats, most: Floats, plan: Ints, sent: Floats, by_turns: Bools, shown_s: Floats,
 ) -> tuple[Ints, Ints]:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
@@ -47,6 +48,8 @@ def schedules(
     `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
     not free, what is left of the last one.
+
+    Junctions that go `by_turns` (J,) show that stage next which was shown longest ago, at `shown_s` (S,).
     """
     wish, then = stage.copy(), stage.copy()
     for junction in range(len(stage)):
@@ -65,12 +68,14 @@ def schedules(
         if rules.gaps.some[low : low + stages].any():
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, rules.gaps, stand[a:b], come[a:b, :bins].copy(),
-                worth[a:b], ends[a:b], kept[a:b], most[a:b], plan[junction, :bins], goes,
+                worth[a:b], ends[a:b], kept[a:b], most[a:b], plan[junction, :bins], goes, by_turns[junction],
+                shown_s[low : low + stages],
             )  # fmt: skip
         else:
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, None, stand[a:b], come[a:b, :bins].copy(), worth[a:b],
-                ends[a:b], kept[a:b], most[a:b], plan[junction, :bins], goes,
+                ends[a:b], kept[a:b], most[a:b], plan[junction, :bins], goes, by_turns[junction],
+                shown_s[low : low + stages],
             )  # fmt: skip
         sent[a:b, :bins] = goes
         wish[junction] = rules.stages[low + chosen]
@@ -86,7 +91,7 @@ def schedules(
 @compiled
 def _schedule(
     present: int, rest: int, low: int, stages: int, rules: Rules, gaps: Gaps | None, stand: Floats, come: Floats,
-    worth: Floats, ends: Floats, kept: Floats, most: Floats, plan: Ints, sent: Floats,
+    worth: Floats, ends: Floats, kept: Floats, most: Floats, plan: Ints, sent: Floats, by_turns: bool, shown_s: Floats,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on.
 
@@ -95,12 +100,15 @@ def _schedule(
     chosen = present
     called = _called(present, low, stages, rules, stand, come)
     if called.any():
+        after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
+        if by_turns:
+            after &= in_turn(called, present, shown_s)
         traffic = _sums(rules.moves[low : low + stages], stand, come, worth, ends, kept, most)
         # What was best a bin ago is seldom far from what is best now.
         _send_off(plan, rules, gaps, stand, come, most, sent)
         known = _waited(sent, traffic, plan[-1], low, stages, rules)
         for limit in (known + ALIKE * (2 + known), NEVER):
-            chosen = _search(present, rest, low, called, rules, gaps, traffic, limit, plan)
+            chosen = _search(present, rest, low, after, rules, gaps, traffic, limit, plan)
             if chosen >= 0:
                 break
     else:
@@ -129,15 +137,18 @@ def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, co
 
 @compiled
 def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for the compiler
-    present: int, rest: int, low: int, called: Bools, rules: Rules, gaps: Gaps | None, traffic: Traffic, limit: float,
+    present: int, rest: int, low: int, after: Bools, rules: Rules, gaps: Gaps | None, traffic: Traffic, limit: float,
     plan: Ints,
 ) -> int:  # fmt: skip
-    """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more."""
+    """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more.
+
+    `after` (s, s) has which stage may come after each.
+    """
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
     ends, due = traffic.ends, traffic.due
     moves, going, clearing, clearance = rules.moves, rules.going, rules.clearing, rules.clearance
     came, least = traffic.came, rules.least
-    (streams, bins), stages = come.shape, len(called)
+    (streams, bins), stages = come.shape, len(after)
     # The state: the stage that begins and when; for each the cost until then, by what it won, the queues, and whence.
     cost, rank = np.full((bins + 1, stages), NEVER), np.full((bins + 1, stages), NEVER)
     queue = np.empty((bins, stages, streams))
@@ -146,7 +157,6 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     cost[0, present] = 0.0
     queue[0, present] = traffic.stand
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
-    after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
     others, veh = np.empty(stages, np.int64), np.empty(streams)
     pace, free, want, to_come, amid = np.ones((5, streams))
     stood, left = np.empty((2, stages + 1))
