@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from tests.integration import odd_nets
 from tests.unit.views import scene
 from utn_controllers.scheduled.outlook import Outlook
-from utn_controllers.scheduled.pockets import HOLDING, held_up, rooms_veh
+from utn_controllers.scheduled.pockets import HOLDING, held_up, rooms_veh, taken
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo import streets
 from utn_sumo.contract import ZONES_M, Floats, Network
@@ -27,14 +28,21 @@ def pockets(tmp_path_factory: pytest.TempPathFactory) -> Network:
 
 
 def held(
-    own: tuple[float, ...], before: float, far: float, cut: tuple[float, float] = (0.2, 0.3)
+    own: tuple[float, ...],
+    before: float,
+    far: float,
+    cut: tuple[float, float] = (0.2, 0.3),
+    of_lanes: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> tuple[Floats, Floats]:
-    """Of a link of three lane groups, with so many on the `own` lanes of each, `before` they part and out of sight."""
+    """Of a link of three lane groups, with so many on the `own` lanes of each, `before` they part and out of sight.
+
+    Whose queues take these shares of the lanes before them.
+    """
     zone, upstream = np.zeros((3, len(ZONES_M))), np.zeros((1, len(ZONES_M)))
     zone[:, 0], upstream[0, 2] = own, before
     share, x = np.array([*cut, 1 - sum(cut)]), np.array([sum(own) + before + far])
     room, link = np.full(3, ROOM_VEH), np.zeros(3, dtype=np.int64)
-    return held_up(zone.sum(axis=1), upstream, x, share, room, np.array([BEFORE_VEH]), link)
+    return held_up(zone.sum(axis=1), upstream, x, share, room, np.array([BEFORE_VEH]), np.array(of_lanes), link)
 
 
 @given(own=st.tuples(veh, veh, veh), before=veh, far=veh, cut=st.tuples(st.floats(0.1, 0.4), st.floats(0.1, 0.4)))
@@ -62,6 +70,34 @@ def test_others_get_past_the_less_the_longer_the_queues_are() -> None:
     assert shut[-1] == pytest.approx([0.0, 1.0, 1.0])
 
 
+def test_on_lanes_that_no_queue_takes_the_others_go_on() -> None:
+    full = ROOM_VEH, 0.0, 0.0
+    shut, weight = held(full, BEFORE_VEH, 30.0)
+    for of_lanes in (0.5, 1 / 3):
+        fewer, less = held(full, BEFORE_VEH, 30.0, of_lanes=(of_lanes, 1.0, 1.0))
+        assert fewer == pytest.approx(of_lanes * shut)
+        assert 1 < less[0] < weight[0]
+        # As if there were fewer behind.
+        assert less == pytest.approx(held(full, of_lanes * BEFORE_VEH, 30.0 * of_lanes)[1])
+    # A pocket is shut whatever it would take itself.
+    assert held((0.0, ROOM_VEH, 0.0), BEFORE_VEH, 30.0, of_lanes=(0.3, 1.0, 1.0))[0] == pytest.approx([1.0, 0.0, 1.0])
+
+
+def test_a_pocket_takes_one_lane_of_those_before_it(pockets: Network, tmp_path: Path) -> None:
+    assert taken(pockets) == pytest.approx(1.0)
+    streets_of = odd_nets.row("C", lanes=3).without("W-C")
+    streets_of.node("w", -60, 0)
+    streets_of.one_way("W", "w", lanes=3)
+    streets_of.one_way("w", "C", lanes=4)
+    network = streets.named(str(odd_nets.case(streets_of.net(tmp_path, odd_nets.NO_TURNAROUNDS).parent, "")))
+    link = next(index for index, each in enumerate(network.links) if each.edges == ("W-w", "w-C"))
+    lanes = [sum(len(each.lanes) for each in network.lane_sets if each.group == g) for g in range(len(network.groups))]
+    own = network.group_link == link
+    assert sorted(np.array(lanes)[own]) == [1, 3]
+    assert taken(network)[own] == pytest.approx(np.array(lanes)[own] / 3)
+    assert taken(network)[~own] == pytest.approx(np.minimum(np.array(lanes)[~own] / 3, 1))
+
+
 @given(
     own=st.tuples(veh, veh, veh),
     before=veh,
@@ -83,7 +119,7 @@ def test_where_lanes_never_part_nobody_is_held_up(utn17: Network) -> None:
     zone = np.full((len(utn17.groups), len(ZONES_M)), 20.0)
     share, x = utn17.group_shares(utn17.fraction), utn17.storage_veh
     nobody = np.zeros((len(utn17.links), len(ZONES_M)))
-    shut, weight = held_up(zone.sum(axis=1), nobody, x, share, *rooms_veh(utn17), utn17.group_link)
+    shut, weight = held_up(zone.sum(axis=1), nobody, x, share, *rooms_veh(utn17), taken(utn17), utn17.group_link)
     assert not shut.any()
     assert (weight == 1).all()
 

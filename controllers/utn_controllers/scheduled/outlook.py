@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from utn_controllers.scheduled.pockets import held_up, rooms_veh
+from utn_controllers.scheduled.pockets import held_up, rooms_veh, taken
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.compiling import compiled
 from utn_sumo.contract import ZONES_M, Bools, Floats, Ints, Network
@@ -57,7 +57,7 @@ class Outlook:
         self.sent_veh = np.zeros((len(streams.link), bins))
         """(N, K) vehicles that each stream's schedule sends off in each bin, from the one that it was made in on."""
         set_veh, before_veh = rooms_veh(network)
-        self._room = np.bincount(network.set_group, set_veh, len(network.groups)), before_veh
+        self._room = np.bincount(network.set_group, set_veh, len(network.groups)), before_veh, taken(network)
         self.take_up(network.fraction)
 
     @property
@@ -134,6 +134,7 @@ def _look(
     sight_s: Floats,
     room: Floats,
     upstream_room: Floats,
+    taken: Floats,
     junction: Ints,
     group_link: Ints,
     set_group: Ints,
@@ -155,7 +156,7 @@ def _look(
         if asked[link] and due_s[link] > sight_s[link]:
             _arrive(came[:, link], now, max(far[link], 0.0), sight_s[link], due_s[link], coming[link], bin_s)
     _send(asked, sent, next_link, came[now], rate, due_s, coming, bin_s)
-    shut, held = held_up(seen, upstream, x, share, room, upstream_room, group_link)
+    shut, held = held_up(seen, upstream, x, share, room, upstream_room, taken, group_link)
     stand, come = np.zeros(len(stream_link)), np.zeros((len(stream_link), bins))
     for stream in range(len(stream_link)):
         lane_set, link = stream_set[stream], stream_link[stream]

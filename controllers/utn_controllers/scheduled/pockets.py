@@ -1,7 +1,8 @@
 """Who is held up by a full pocket: behind it queue those too who go elsewhere, and who will not be in their lanes soon.
 
-Where lanes part shortly before the stop line, a queue that fills its own lanes stands in the way of all others. Who is
-behind comes on as that queue goes, so that everybody of it is worth those who wait for him.
+Where lanes part shortly before the stop line, a queue that fills its own lanes stands in the way of all others who are
+on as many of the lanes before these. Who is behind comes on as that queue goes, so that everybody of it is worth those
+who wait for him.
 """
 
 from __future__ import annotations
@@ -33,33 +34,48 @@ def rooms_veh(network: Network) -> tuple[Floats, Floats]:
     return set_m * jam_veh_m[network.set_link], before_m * jam_veh_m
 
 
+def taken(network: Network) -> Floats:
+    """(G,) share that a queue of each lane group takes of the lanes before its own: of three a pocket takes one."""
+    lanes = np.bincount(network.set_group, [len(each.lanes) for each in network.lane_sets], len(network.groups))
+    before = np.array([len(network.edge_lanes[link.edges[max(len(link.edges) - 2, 0)]]) for link in network.links])
+    return np.asarray(np.minimum(lanes / before[network.group_link], 1.0))
+
+
 @compiled
 def held_up(
-    seen: Floats, upstream: Floats, x: Floats, share: Floats, room: Floats, before: Floats, group_link: Ints
-) -> tuple[Floats, Floats]:
+    seen: Floats, upstream: Floats, x: Floats, share: Floats, room: Floats, before: Floats, taken: Floats,
+    group_link: Ints,
+) -> tuple[Floats, Floats]:  # fmt: skip
     """(G,) how few come into a lane group from before the lanes part, 0 to 1; (G,) what a vehicle in it weighs.
 
     By the vehicles `seen` on the lanes of each (G,), in the zones before them (Z, zones) and on links `x` (Z,), the
-    `share` (G,) of the traffic that they have, and the `room` of their lanes (G,) and of those `before` (Z,).
+    `share` (G,) of the traffic that they have, the `room` of their lanes (G,) and of those `before` (Z,), and what is
+    `taken` (G,) of these. On the other ones all go on.
     """
-    holds, shuts, weight = np.zeros(len(seen)), np.zeros(len(seen)), np.ones(len(seen))
+    holds, queues, weight = np.zeros(len(seen)), np.zeros(len(seen)), np.ones(len(seen))
     within, stuck_veh, stuck_share = np.zeros(len(x)), np.zeros(len(x)), np.zeros(len(x))
-    held, shut = np.zeros(len(x)), np.zeros(len(x))
+    held, queue = np.zeros(len(x)), np.zeros(len(x))
     for group, link in enumerate(group_link):
         veh = seen[group]
         within[link] += veh
         if before[link] > 0:
             own, dense = veh / room[group], upstream[link].sum() / before[link]
-            holds[group], shuts[group] = _queues(own, dense, HOLDING), _queues(own, dense, SHUT)
+            holds[group], queues[group] = _queues(own, dense, HOLDING), _queues(own, dense, SHUT)
             stuck_veh[link] += holds[group] * veh
             stuck_share[link] += holds[group] * share[group]
-            held[link], shut[link] = max(held[link], holds[group]), max(shut[link], shuts[group])
+            held[link], queue[link] = max(held[link], holds[group]), max(queue[link], queues[group])
+    shut = np.zeros(len(seen))
     for group, link in enumerate(group_link):
         if held[link] > 0:
-            behind = max(x[link] - within[link], upstream[link].sum())
+            behind = taken[group] * max(x[link] - within[link], upstream[link].sum())
             veh, part = stuck_veh[link] / held[link], stuck_share[link] / held[link]
             weight[group] += holds[group] * ((veh + behind) / (veh + behind * part) - 1)
-    return shut[group_link] - shuts, weight
+        if queue[link] > 0:
+            # Who goes into a queue as long is behind his own, not held up.
+            for other in range(len(seen)):
+                if group_link[other] == link:
+                    shut[group] = max(shut[group], taken[other] * (queues[other] - queues[group]))
+    return shut, weight
 
 
 @compiled
