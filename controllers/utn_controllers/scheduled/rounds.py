@@ -1,9 +1,7 @@
 """Where far more are there than can go at a junction alone, each stage has its turn once before any has a second one.
 
-A schedule reaches two or three greens, and of four queues too long for it would show the two that are worth a little
-more, again and again. What that is worth changes with every green, and who has been left out has all of it after two
-minutes; meanwhile others go who could have waited. A queue that is let go in every round is no longer at its end than
-one of another road.
+A schedule reaches two or three greens. Of four queues or more that are all too long for it, it would show those again
+and again that are worth a little more, for less and less long.
 
 Not where a road has green in more than one stage: those who turn left from it are few, and are let go less often. Nor
 where fewer are there: then the stage comes next that has a platoon.
