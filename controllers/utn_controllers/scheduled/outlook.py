@@ -134,7 +134,7 @@ def _look(
     sight_s: Floats,
     room: Floats,
     upstream_room: Floats,
-    taken: Floats,
+    of_before: Floats,
     junction: Ints,
     group_link: Ints,
     set_group: Ints,
@@ -156,7 +156,7 @@ def _look(
         if asked[link] and due_s[link] > sight_s[link]:
             _arrive(came[:, link], now, max(far[link], 0.0), sight_s[link], due_s[link], coming[link], bin_s)
     _send(asked, sent, next_link, came[now], rate, due_s, coming, bin_s)
-    shut, held = held_up(seen, upstream, x, share, room, upstream_room, taken, group_link)
+    shut, held = held_up(seen, upstream, x, share, room, upstream_room, of_before, group_link)
     stand, come = np.zeros(len(stream_link)), np.zeros((len(stream_link), bins))
     for stream in range(len(stream_link)):
         lane_set, link = stream_set[stream], stream_link[stream]

@@ -43,14 +43,14 @@ def taken(network: Network) -> Floats:
 
 @compiled
 def held_up(
-    seen: Floats, upstream: Floats, x: Floats, share: Floats, room: Floats, before: Floats, taken: Floats,
+    seen: Floats, upstream: Floats, x: Floats, share: Floats, room: Floats, before: Floats, of_before: Floats,
     group_link: Ints,
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """(G,) how few come into a lane group from before the lanes part, 0 to 1; (G,) what a vehicle in it weighs.
 
     By the vehicles `seen` on the lanes of each (G,), in the zones before them (Z, zones) and on links `x` (Z,), the
     `share` (G,) of the traffic that they have, the `room` of their lanes (G,) and of those `before` (Z,), and what is
-    `taken` (G,) of these. On the other ones all go on.
+    taken `of_before` (G,). On the other ones all go on.
     """
     holds, queues, weight = np.zeros(len(seen)), np.zeros(len(seen)), np.ones(len(seen))
     within, stuck_veh, stuck_share = np.zeros(len(x)), np.zeros(len(x)), np.zeros(len(x))
@@ -67,14 +67,14 @@ def held_up(
     shut = np.zeros(len(seen))
     for group, link in enumerate(group_link):
         if held[link] > 0:
-            behind = taken[group] * max(x[link] - within[link], upstream[link].sum())
+            behind = of_before[group] * max(x[link] - within[link], upstream[link].sum())
             veh, part = stuck_veh[link] / held[link], stuck_share[link] / held[link]
             weight[group] += holds[group] * ((veh + behind) / (veh + behind * part) - 1)
         if queue[link] > 0:
             # Who goes into a queue as long is behind his own, not held up.
             for other in range(len(seen)):
                 if group_link[other] == link:
-                    shut[group] = max(shut[group], taken[other] * (queues[other] - queues[group]))
+                    shut[group] = max(shut[group], of_before[other] * (queues[other] - queues[group]))
     return shut, weight
 
 

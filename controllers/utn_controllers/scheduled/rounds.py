@@ -16,7 +16,7 @@ from utn_sumo.compiling import compiled
 from utn_sumo.contract import Bools, Floats, Ints
 
 FEWEST_STAGES = 4
-"""Of three stages a schedule sees the next turn of each."""
+"""Of three stages a schedule sees most: by turns they had 0.98 to 1.05 of the delay."""
 FAR_BEYOND = 0.9
 """A junction is far over capacity with more to let go beyond its schedule than so many times what the schedule has."""
 
