@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.integration import odd_nets
 from tests.unit.views import scene
 from utn_controllers.scheduled.outlook import Outlook
-from utn_controllers.scheduled.pockets import EASED, HOLDING, eased, held_up, rooms_veh, taken
+from utn_controllers.scheduled.pockets import HOLDING, held_up, rooms_veh, taken
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo import streets
 from utn_sumo.contract import ZONES_M, Floats, Network
@@ -113,16 +113,6 @@ def test_a_little_more_traffic_changes_no_weight_at_a_stroke(
     more[where] += 0.01
     for now, then in zip(held(own, before, far, cut), held(tuple(more[:3]), more[3], far, cut), strict=True):
         assert then == pytest.approx(now, abs=0.2)
-
-
-@given(weight=st.floats(1, 20), beyond=st.floats(0, 3), more=st.floats(0, 3))
-def test_who_holds_others_up_weighs_less_the_less_green_there_is_for_these(
-    weight: float, beyond: float, more: float
-) -> None:
-    free, now, then, far = (float(eased(np.array([weight]), np.array([b]))[0]) for b in (0, beyond, beyond + more, 99))
-    assert free == pytest.approx(weight)
-    assert free >= now >= then >= far >= 1
-    assert far - 1 == pytest.approx(EASED[1] * (weight - 1))
 
 
 def test_where_lanes_never_part_nobody_is_held_up(utn17: Network) -> None:

@@ -14,7 +14,6 @@ from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
 from utn_controllers.scheduled.parked import Parked
-from utn_controllers.scheduled.pockets import eased
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.rounds import Rounds
 from utn_controllers.scheduled.sides import Sides
@@ -105,7 +104,6 @@ class Scheduled:
         )
         self._ending = Ending(self._streams, lost_bins, ahead, alone)
         self._rounds = Rounds(self._streams, self._rules.follows, ahead)
-        self._group_junction = network.link_junction[network.group_link]
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules, of each junction as far as they go."""
         self._sent_veh = np.zeros((len(self._calling.letters), bins))
@@ -140,9 +138,6 @@ class Scheduled:
         parked_veh = self._parked.leave_out(view.time_s, view.free, present, zones[0])
         outlook = self._outlook
         stand, come, held = outlook.look(view, zones, parked_veh)
-        beyond_bins = self._ending.beyond_bins(view.free, stand, come)
-        if beyond_bins.any():
-            held = eased(held, (beyond_bins / self._rules.ahead)[self._group_junction])
         self._within.look(view, zones[0][:, 0], outlook.shares.of_link, stand, held)
         stuck = self._standstill.look(view, present, stand)
         self._yielding.look(view, view.free, present, zones[0])
@@ -155,6 +150,7 @@ class Scheduled:
         else:
             rest_s = self._green_s[view.stage] - (view.time_s - view.begin_s)
             rest = np.clip(rest_s / BIN_S, 0, self._plan.shape[1]).astype(np.int64)
+        beyond_bins = self._ending.beyond_bins(view.free, stand, come)
         ends, kept = self._ending.weights(worth, beyond_bins)
         by_turns = self._rounds.look(view.time_s, present, beyond_bins)
         waiting = self._sides.look(view, present)

@@ -22,10 +22,6 @@ Limits that are one number each would have what is worth most change from one de
 stage put off again and again.
 """
 
-EASED = 0.5, 0.45
-"""Where a junction alone needs half of a schedule more than it has, or more than that, who holds others up weighs so
-much of what he would above others. They would come on only to wait again: for a green of their own."""
-
 
 def rooms_veh(network: Network) -> tuple[Floats, Floats]:
     """(L,) vehicles that the lanes in sight hold of each lane set, (Z,) and of each link before its lanes part."""
@@ -80,15 +76,6 @@ def held_up(
                 if group_link[other] == link:
                     shut[group] = max(shut[group], of_before[other] * (queues[other] - queues[group]))
     return shut, weight
-
-
-def eased(held: Floats, beyond: Floats) -> Floats:
-    """(G,) by how much more those weigh who hold others up, if it is `held` (G,) where there is green for all.
-
-    By the green that is needed `beyond` schedules, in shares of these (G,).
-    """
-    most, left = EASED
-    return np.asarray(1 + (held - 1) * (1 - (1 - left) * np.minimum(beyond / most, 1)))
 
 
 @compiled
