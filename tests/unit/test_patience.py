@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.integration import odd_nets
 from tests.unit.views import allowed, scene
-from utn_sumo.contract import Floats, Network
+from utn_sumo.contract import SAMPLE_S, Floats, Network
 from utn_sumo.plant.heads import Heads
 from utn_sumo.plant.patience import LONGEST_RED_S, LOOK_S, MOST_PATIENCE_S, PAUSE_S, STARTING_S, Patience, longest_red_s
 
@@ -44,6 +44,15 @@ def test_who_creeps_on_for_a_moment_waits_still_and_who_has_gone_does_not(utn17:
             now = scene(utn17, float(time_s), veh=float(stands))
             kept = allowed(patience, now.stage, now)
         assert (kept != now.stage).all() == forced
+
+
+def test_whom_each_sample_of_a_report_sees_wait_has_green_within_the_longest_red(utn17: Network) -> None:
+    patience, decision_s = Patience(utn17, no_holds(utn17)), 2.0
+    for time_s in np.arange(0, LONGEST_RED_S, decision_s):
+        # Between two samples nobody stands.
+        now = scene(utn17, float(time_s), veh=float(time_s % SAMPLE_S == 0))
+        kept = allowed(patience, now.stage, now)
+    assert (kept != now.stage).all()
 
 
 def test_who_has_had_green_in_one_stage_does_not_call_for_another(utn17: Network) -> None:

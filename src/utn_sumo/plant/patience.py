@@ -11,7 +11,7 @@ import numpy as np
 
 from utn_sumo import callers, clearances
 from utn_sumo.compiling import compiled
-from utn_sumo.contract import Bools, Floats, Ints, Network, View
+from utn_sumo.contract import SAMPLE_S, Bools, Floats, Ints, Network, View
 
 LONGEST_RED_S = 180.0
 """Nobody is to wait longer without green, whatever is wished."""
@@ -24,8 +24,9 @@ LEAST_LONGEST_RED_S = 90.0
 """But where that is soon no sooner than this: there would be hardly any time for anything but clearances."""
 LOOK_S = 5.0
 """Time between two looks at who waits, or a little more."""
-PAUSE_S = 10.0
-"""Who has stood so short a time ago waits still: in a queue that creeps nobody stands for a moment."""
+PAUSE_S = SAMPLE_S
+"""Who has stood so short a time ago waits still: in a queue that creeps nobody stands for a moment. Reports, which look
+so often (metrics), have it so too."""
 
 
 def longest_red_s(teleport_s: float) -> float:
@@ -85,7 +86,8 @@ class Patience:
         """See who waits, if it is time to."""
         if view.time_s < self._look_s:
             return
-        self._look_s = view.time_s + LOOK_S
+        # Among the looks are all those of reports: whom these see wait is known here.
+        self._look_s = (view.time_s // LOOK_S + 1) * LOOK_S
         waits, troubled = _look(
             view.time_s, view.stage, view.set_waiting_veh, view.calling, self._way_set, self._needs, self._served,
             self._junction, self._carefree_s, self._stood_s, self._since_s,
