@@ -21,6 +21,7 @@ from utn_controllers.scheduled.ending import (
     Ending,
     ahead_bins,
     are_alone,
+    are_apart,
     beyond,
     greens,
     lost,
@@ -34,6 +35,7 @@ from utn_controllers.scheduled.moves import Moves, Rules, going
 from utn_controllers.scheduled.programme import schedules
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.worth import Worth
+from utn_sumo import streets
 from utn_sumo.contract import EXIT, ZONES_M, Bools, Floats, Ints, Network
 from utn_sumo.estimation import Estimator
 from utn_sumo.plant.heads import Heads
@@ -592,6 +594,31 @@ class TestEnding:
         assert ahead_bins(alone, 100, np.array([30])) == [100]
         assert not are_alone(utn17, Streams(utn17)).any()
         assert (ahead_bins(are_alone(utn17, Streams(utn17)), 25, np.full(8, 30)) == 25).all()
+
+    @pytest.mark.parametrize(
+        ("names", "gap_m", "layout", "found"),
+        [
+            ("AB", 400, "incoming", [True, True]),
+            ("ABC", 400, "incoming", [True, True, True]),
+            # The road between them is full within one green, or a schedule reaches all that there is.
+            ("AB", 120, "incoming", [False, False]),
+            ("AB", 400, "opposites", [False, False]),
+            ("A", 400, "opposites", [True]),
+        ],
+    )
+    def test_long_greens_count_where_many_stages_let_go_what_the_roads_ahead_take(
+        self, tmp_path: Path, names: str, gap_m: float, layout: str, found: list[bool]
+    ) -> None:
+        row = odd_nets.row(names, gap_m=gap_m, lanes=2)
+        net = streets.named(str(row.net(tmp_path, odd_nets.NO_TURNAROUNDS, "--tls.layout", layout)))
+        streams = Streams(net)
+        assert are_apart(net, streams, are_alone(net, streams)).tolist() == found
+        if len(names) > 1:
+            # Nobody knows how much is to be let go where a queue can reach back onto roads unseen.
+            amid = replace(net.links[int(net.link_junction.argmin())], begins_amid=True)
+            links = tuple(amid if link.id == amid.id else link for link in net.links)
+            hemmed = replace(net, links=links)
+            assert are_apart(hemmed, streams, are_alone(hemmed, streams)).tolist() == [False, *found[1:]]
 
     def test_whoever_needs_a_stage_for_himself_has_others_wait_for_him(self) -> None:
         # A main road of two streams beside a left turn, and a side road.

@@ -7,9 +7,10 @@ wait for him: letting him go takes time of a stage, in which nobody else's vehic
 and the others many, that is the greater part of it, and a schedule that did not count it would skip the one stage in
 every other cycle, and have its queue wait twice as long for a second or two of all others.
 
-At a junction alone where more are there and will come than can go in a schedule, all who come until they have gone wait
-for as long as it takes to let one more go. At capacity that is long, and a schedule that did not count it would change
-its stages as if there were time to spare: those of many lanes again and again, while the queue of a single lane grows.
+At a junction apart (`are_apart`) where more are there and will come than can go in a schedule, all who come until they
+have gone wait for as long as it takes to let one more go. At capacity that is long, and a schedule that did not count
+it would change its stages as if there were time to spare: those of many lanes again and again, while the queue of a
+single lane grows.
 
 Not quite as long if he has green at the end: he goes without another clearance, and the longer greens last, the fewer
 there are of these. Else it would be all the same when a schedule changes from one long queue to another, since that
@@ -38,18 +39,24 @@ LEAST_LOAD, NONE_BINS = 1e-6, 1e-9
 """Who hardly comes needs some green too; green that is none."""
 
 FAR_BINS, FARTHER, FARTHEST_BINS = 9, 3.0, 60
-"""For each bin more than so many that clearances take of a cycle, a schedule of a junction alone goes so many farther,
+"""For each bin more than so many that clearances take of a cycle, a schedule of a junction apart goes so many farther,
 up to so many. One that ends before each stage has had its turn changes them more often than there is time for, and has
 those wait of whom fewest leave in a bin."""
+APART_STAGES = 4
+"""A junction among others can be apart if it has so many stages: of three a schedule sees most."""
+FILLING_S = 84.0
+"""Time in which the queues before it would fill each road ahead, at their saturation flows, if nobody left that."""
+OUTSIDE = 0.5
+"""Share of its roads that come from outside, or more."""
 
 
 class Ending:
     """Keeps what a vehicle of each stream weighs that is left at a schedule's end."""
 
-    def __init__(self, streams: Streams, lost_bins: Ints, ahead_bins: Ints, alone: Bools):
-        """Of `lost`, how far schedules go, and `are_alone` (J,)."""
+    def __init__(self, streams: Streams, lost_bins: Ints, ahead_bins: Ints, apart: Bools):
+        """Of `lost`, how far schedules go, and `are_apart` (J,)."""
         self._streams = streams
-        self._lost_bins, self._ahead_bins, self._alone = lost_bins, ahead_bins, alone
+        self._lost_bins, self._ahead_bins, self._apart = lost_bins, ahead_bins, apart
         self.staying_bins = staying(lost_bins)
         """(J,) that who is left waits longer."""
         self._staying = np.repeat(self.staying_bins, np.diff(streams.first))
@@ -70,16 +77,16 @@ class Ending:
             self._needing[own] = weight * needing(serves, come_veh[own], most_veh[own])
 
     def beyond_bins(self, asked: Bools, stand: Floats, come: Floats) -> Floats:
-        """(J,) that those of `asked` (J,) that are alone need beyond their schedules to let all go; else none.
+        """(J,) that those of `asked` (J,) that are apart need beyond their schedules to let all go; else none.
 
         `stand` (N,), `come` (N, K) vehicles as of `schedules`.
         """
-        if not self._alone.any():
+        if not self._apart.any():
             return np.zeros(len(asked))
         streams = self._streams
         return np.asarray(
             beyond(
-                asked & self._alone, self._ahead_bins, self._lost_bins, streams.first, streams.first_stage,
+                asked & self._apart, self._ahead_bins, self._lost_bins, streams.first, streams.first_stage,
                 streams.serves, streams.lane_set, self._lanes, stand, come,
             )
         )  # fmt: skip
@@ -208,9 +215,29 @@ def are_alone(network: Network, streams: Streams) -> Bools:
     return alone
 
 
-def ahead_bins(alone: Bools, bins: int, lost_bins: Ints) -> Ints:
-    """(J,) bins that schedules have: so many, or more of junctions `alone` (J,) whose cycles lose `lost_bins` (J,)."""
-    more = FARTHER * np.maximum(lost_bins - FAR_BINS, 0) * alone
+def are_apart(network: Network, streams: Streams, alone: Bools) -> Bools:
+    """(J,) junctions at which more greens than those of a schedule count: those `alone` (J,) and others like them.
+
+    Longer greens save clearances, but fill the roads ahead. So it pays where these take all that leaves in a long green
+    and most who come are from outside, not where somebody waits unseen behind a road: how much is to be let go is not
+    known there.
+    """
+    count, links = len(alone), np.bincount(network.link_junction, minlength=len(alone))
+    onward = streams.next_link != EXIT
+    ahead = streams.next_link[onward]
+    fills_s = network.storage_veh[ahead] / network.set_saturation_flow_veh_s[streams.lane_set[onward]]
+    fed = np.zeros(len(network.links), dtype=np.bool_)
+    fed[ahead] = True
+    from_others = np.bincount(network.link_junction, fed, count)
+    apart = (np.diff(streams.first_stage) >= APART_STAGES) & (from_others <= (1 - OUTSIDE) * links)
+    apart[network.link_junction[streams.link[onward][fills_s < FILLING_S]]] = False
+    apart[network.link_junction[network.begins_amid]] = False
+    return np.asarray(apart | alone)
+
+
+def ahead_bins(apart: Bools, bins: int, lost_bins: Ints) -> Ints:
+    """(J,) bins that schedules have: so many, or more of junctions `apart` (J,) whose cycles lose `lost_bins` (J,)."""
+    more = FARTHER * np.maximum(lost_bins - FAR_BINS, 0) * apart
     return np.rint(np.minimum(bins + more, max(FARTHEST_BINS, bins))).astype(np.int64)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.scheduled.calling import Calling
-from utn_controllers.scheduled.ending import Ending, ahead_bins, are_alone, lost
+from utn_controllers.scheduled.ending import Ending, ahead_bins, are_alone, are_apart, lost
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
@@ -72,7 +72,8 @@ class Scheduled:
         alone = are_alone(network, self._streams)
         moves = Moves(network, self._calling, BIN_S, alone)
         lost_bins = lost(self._streams.first_stage, moves.bins)
-        ahead = ahead_bins(alone, round(self.settings.horizon_s / BIN_S), lost_bins)
+        apart = are_apart(network, self._streams, alone)
+        ahead = ahead_bins(apart, round(self.settings.horizon_s / BIN_S), lost_bins)
         bins = int(ahead.max())
         self._outlook = Outlook(network, self._streams, bins, BIN_S)
         self._worth = Worth(
@@ -102,7 +103,7 @@ class Scheduled:
             ahead,
             self._giving.gaps,
         )
-        self._ending = Ending(self._streams, lost_bins, ahead, alone)
+        self._ending = Ending(self._streams, lost_bins, ahead, apart)
         self._rounds = Rounds(self._streams, self._rules.follows, ahead)
         self._plan = np.full((len(network.junctions), bins), -1)
         """(J, K) the last schedules, of each junction as far as they go."""

@@ -1,4 +1,4 @@
-"""Where far more are there than can go at a junction alone, each stage has its turn once before any has a second one.
+"""Where far more are there than can go at a junction apart, each stage has its turn once before any has a second one.
 
 A schedule reaches two or three greens. Of four queues or more that are all too long for it, it would show those again
 and again that are worth a little more, for less and less long.
