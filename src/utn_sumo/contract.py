@@ -68,6 +68,8 @@ class Link:
     """SUMO lanes, inside nodes without signals, over which traffic comes onto the link amid it."""
     parting: tuple[str, ...] = ()
     """Those over which it leaves amid it."""
+    parting_m: tuple[float, ...] = ()
+    """How far before the stop line each of those begins."""
     begins_amid: bool = False
     """Whether it begins amid the net without another link that leads to it: nobody sees who waits behind its queue."""
     entry_flow_veh_s: float = np.inf
@@ -768,6 +770,11 @@ class View(Protocol):
     @property
     def left_veh(self) -> Floats:
         """(L,) vehicles that have left over the stop line of each lane set since the run began."""
+        ...
+
+    @property
+    def parted_veh(self) -> Floats:
+        """(Z,) vehicles that have left each link amid it since the run began."""
         ...
 
     @property

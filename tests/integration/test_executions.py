@@ -73,7 +73,7 @@ class Scribbles(Turns):
     def taken(self, view):
         for seen in (view.set_waiting_veh, view.waiting_veh, view.near_veh, view.calling):
             seen[:] = 0
-        for seen in (view.x_veh, view.entered_veh, view.left_veh):
+        for seen in (view.x_veh, view.entered_veh, view.left_veh, view.parted_veh):
             seen[:] = 1000
         return view.stage
     def wish(self, view):
@@ -430,15 +430,20 @@ class Aside:
     every_s = 2
     def __init__(self, network, path):
         self.network, self.path = network, path
+        self.off = {"t-A": ("t-st", set()), "u-B": ("u-su", set())}
     def begin(self, plan, state):
         pass
     def wish(self, view):
+        parted = [view.parted_veh[self.network.link_index(link)] for link in self.off]
+        for edge, gone in self.off.values():
+            gone.update(libsumo.edge.getLastStepVehicleIDs(edge))
+        truly = [len(gone) for _, gone in self.off.values()]
         every = np.ones(len(self.network.side_roads), dtype=bool)
         stand, left = view.side_standing_veh(every), view.side_left_veh(every)
         edges = [side.edge for side in self.network.side_roads]
         true = [libsumo.edge.getLastStepHaltingNumber(edge) for edge in edges]
         with open(self.path, "a", encoding="utf-8") as file:
-            print(*left, *stand, *true, file=file)
+            print(*left, *stand, *true, *parted, *truly, view.parted_veh.sum(), file=file)
         return view.stage
 """
 
@@ -453,11 +458,15 @@ def test_who_stands_on_side_roads_is_seen_and_who_leaves_them_is_counted_on_over
         settings={"execution": {"path": str(seen)}},
     )
     assert bridge.run(chosen, tmp_path / "run")["fallbacks"] == 0
-    left, stand, true = np.split(np.loadtxt(seen), 3, axis=1)
+    left, stand, true, parted, truly, all_parted = np.split(np.loadtxt(seen), [2, 4, 6, 8, 10], axis=1)
     # Who is on a loop as a control step begins is counted again in the new one, and in the old one no more.
     assert (np.diff(left, axis=0) >= -1).all()
     # One every 15 s and one every 30 s for 240 s; all have gone by 300 s. Steps of control are a minute.
     assert left[-1].tolist() == [16, 8]
+    # Those who turn off the street, on either side: one may be amid the node, or on a loop as a control step begins.
+    assert (np.abs(parted - truly) <= 1).all()
+    assert (truly[-1] >= 5).all()
+    assert (parted.sum(axis=1) == all_parted[:, 0]).all()
     # Who is slow, but does not stand by SUMO's edges, may stand by its detectors.
     assert true.max() > 0
     assert (stand >= true - 1).all()

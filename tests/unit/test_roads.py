@@ -83,6 +83,9 @@ def test_side_streets_join_and_part_on_the_lanes_that_they_meet_the_road_by(stre
     via = via_lanes(net_of(odd_nets.side_streets))
     assert found.joining == tuple(sorted(via["st-t", "t-u"] + via["su-u", "u-B"]))
     assert found.parting == tuple(sorted(via["A-t", "t-st"] + via["t-u", "u-su"]))
+    last_m, before_m = (street_of(odd_nets.side_streets).edge_length_m[edge] for edge in ("u-B", "t-u"))
+    to_line_m = {**dict.fromkeys(via["A-t", "t-st"], last_m + before_m), **dict.fromkeys(via["t-u", "u-su"], last_m)}
+    assert dict(zip(found.parting, found.parting_m, strict=True)) == pytest.approx(to_line_m)
 
 
 def via_lanes(net: Path) -> dict[tuple[str, str], list[str]]:

@@ -27,6 +27,7 @@ class Scene:
     gap_s: Floats
     entered_veh: Floats
     left_veh: Floats
+    parted_veh: Floats
     set_link: Ints
     set_junction: Ints
     link_junction: Ints
@@ -89,6 +90,7 @@ def scene(
         groups + gap_s,
         np.zeros(len(network.links)),
         sets,
+        np.zeros(len(network.links)),
         network.set_link,
         network.link_junction[network.set_link],
         network.link_junction,

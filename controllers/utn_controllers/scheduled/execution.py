@@ -197,7 +197,7 @@ class Scheduled:
         free, begin_s = np.zeros(len(stage), dtype=np.bool_), np.zeros(len(stage))
         zones = np.zeros((len(self.network.lane_sets), len(ZONES_M))), np.zeros((len(none), len(ZONES_M)))
         calling = np.zeros(len(self.network.callers))
-        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody, calling))
+        self.wish(_Nobody(0.0, stage, begin_s, free, zones, none, none, nobody, none, calling))
 
     def _take_up(self) -> None:
         self._giving.take_up(self._outlook.shares)
@@ -226,6 +226,7 @@ class _Nobody:
     x_veh: Floats
     entered_veh: Floats
     left_veh: Floats
+    parted_veh: Floats
     calling: Floats
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:  # noqa: ARG002 - nobody is anywhere

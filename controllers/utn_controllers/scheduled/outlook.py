@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from utn_controllers.scheduled.parting import Parting
 from utn_controllers.scheduled.pockets import held_up, rooms_veh, taken
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.compiling import compiled
@@ -24,6 +25,8 @@ class Seen(Protocol):
     def x_veh(self) -> Floats: ...
     @property
     def entered_veh(self) -> Floats: ...
+    @property
+    def parted_veh(self) -> Floats: ...
 
 
 class Outlook:
@@ -31,7 +34,7 @@ class Outlook:
 
     Within 200 m the detectors show where vehicles are, and so when they could be at the stop line, whether they stand
     now or not. Farther off are those whom the upstream loops have counted, then those whom the neighbours' schedules
-    send, and as many more as have been coming of late from elsewhere.
+    send, and as many more as have been coming of late from elsewhere. Some of them turn off before (`parting.py`).
     """
 
     def __init__(self, network: Network, streams: Streams, bins: int, bin_s: float):
@@ -56,14 +59,16 @@ class Outlook:
         """Vehicles a bin that come onto each link of late, and of these those that schedules said."""
         self.sent_veh = np.zeros((len(streams.link), bins))
         """(N, K) vehicles that each stream's schedule sends off in each bin, from the one that it was made in on."""
+        self._parting = Parting(network, bin_s)
         set_veh, before_veh = rooms_veh(network)
         self._room = np.bincount(network.set_group, set_veh, len(network.groups)), before_veh, taken(network)
         self.take_up(network.fraction)
 
     @property
     def come_veh(self) -> Floats:
-        """(N,) vehicles that have come in a bin of late."""
-        return np.asarray(self._rate[0][self.streams.link] * self.shares.of_link)
+        """(N,) vehicles that have come in a bin of late, without who turns off."""
+        come = self._rate[0] * self._parting.onward[:, -1]
+        return np.asarray(come[self.streams.link] * self.shares.of_link)
 
     def take_up(self, fraction: Floats) -> None:
         """Go by these turning fractions (M,) from now on."""
@@ -79,6 +84,7 @@ class Outlook:
         """
         self._now = (self._now + 1) % len(self._came)
         streams, network = self.streams, self.network
+        self._parting.look(view.entered_veh, view.parted_veh)
         stand, come, held = _look(
             view.free,
             *zones,
@@ -90,6 +96,7 @@ class Outlook:
             self._rate,
             self.sent_veh,
             self._arrival,
+            self._parting.onward,
             self._due_s,
             self._sight_s,
             *self._room,
@@ -130,6 +137,7 @@ def _look(
     rate: Floats,
     sent: Floats,
     arrival: Floats,
+    onward: Floats,
     due_s: Floats,
     sight_s: Floats,
     room: Floats,
@@ -163,11 +171,11 @@ def _look(
         if not asked[link]:
             continue
         of_upstream = (1 - shut[set_group[lane_set]]) * of_link[stream]
-        stand[stream] = of_set[stream] * zone[lane_set, 0] + of_upstream * upstream[link, 0]
+        stand[stream] = of_set[stream] * zone[lane_set, 0] + of_upstream * onward[link, 0] * upstream[link, 0]
         for place in range(bins):
-            come[stream, place] = of_upstream * coming[link, place]
+            come[stream, place] = of_upstream * onward[link, -1] * coming[link, place]
         for part in range(1, zone.shape[1]):
-            veh = of_set[stream] * zone[lane_set, part] + of_upstream * upstream[link, part]
+            veh = of_set[stream] * zone[lane_set, part] + of_upstream * onward[link, part] * upstream[link, part]
             if veh > 0:
                 for place in range(bins):
                     come[stream, place] += veh * arrival[link, part, place]

@@ -254,6 +254,7 @@ class _Reader:
             turning_worth_veh=self._worth_veh(chain.edges[-1]),
             joining=chain.joining,
             parting=chain.parting,
+            parting_m=chain.parting_m,
         )
 
     def _turns(self) -> tuple[list[Turn], list[LaneGroup], list[tuple[int, ...]]]:

@@ -58,6 +58,8 @@ class Chain:
     edges: tuple[str, ...]
     joining: tuple[str, ...]
     parting: tuple[str, ...]
+    parting_m: tuple[float, ...]
+    """How far before the stop line each of those is."""
 
 
 class Roads:
@@ -70,16 +72,19 @@ class Roads:
 
     def chain(self, approach: str) -> Chain:
         """The link that ends with the edge `approach`."""
-        edges, joining, parting = [approach], list[str](), list[str]()
+        edges, joining, parting, to_line_m = [approach], list[str](), list[tuple[str, float]](), 0.0
         while True:
             edge = self._net.getEdge(edges[0])
             before = self._main_before(edge)
             if before is None or before.getID() in edges:
-                return Chain(tuple(edges), tuple(sorted(joining)), tuple(sorted(parting)))
+                parting.sort()
+                lanes, places_m = tuple(lane for lane, _ in parting), tuple(place_m for _, place_m in parting)
+                return Chain(tuple(edges), tuple(sorted(joining)), lanes, places_m)
             onto = [c for other, each in edge.getIncoming().items() if other is not before for c in for_motors(each)]
             off = [c for other, each in before.getOutgoing().items() if other is not edge for c in for_motors(each)]
             joining += [each.getViaLaneID() for each in onto]
-            parting += [each.getViaLaneID() for each in off]
+            to_line_m += edge.getLength()
+            parting += [(each.getViaLaneID(), to_line_m) for each in off]
             edges.insert(0, before.getID())
 
     def _main_before(self, edge: Any) -> Any | None:

@@ -81,7 +81,9 @@ class Eyes:
         """When what is counted was last held against what is seen."""
         self._entered_veh = np.zeros(self._links)
         self._left_veh = np.zeros(self._sets)
-        """(Z,) vehicles that had come onto each link by then, (L,) that had crossed each lane set's stop line."""
+        self._parted_veh = np.zeros(self._links)
+        """(Z,) vehicles that had come onto each link by then, (L,) that had crossed each lane set's stop line, (Z,)
+        that had left each link amid it."""
         self._side_left_veh = np.zeros(sides)
         """(R,) that had left each side road by then."""
         self._warm_up()
@@ -91,7 +93,9 @@ class Eyes:
         self._x_veh = np.array(x_veh, dtype=np.float64)
         if time_s > 0:
             self._entered_veh = self._entered_veh + self._entries.read(self._counted_last)
-            self._left_veh = self._left_veh + self._exits.read(self._counted_last)[: self._sets]
+            left = self._exits.read(self._counted_last)
+            self._left_veh = self._left_veh + left[: self._sets]
+            self._parted_veh = self._parted_veh + left[self._sets :]
             self._side_left_veh = self._side_left_veh + self._side_lines.read(self._counted_last)
 
     @property
@@ -143,17 +147,19 @@ class Eyes:
         veh = self._zones.read(self._present, junctions).reshape(-1, len(ZONES_M))
         return veh[: self._sets], veh[self._sets :]
 
-    def counted_veh(self, time_s: float) -> tuple[Floats, Floats, Floats]:
+    def counted_veh(self, time_s: float) -> tuple[Floats, Floats, Floats, Floats]:
         """What has been counted by now.
 
-        (Z,) vehicles on each link, (Z,) that have come onto it and (L,) left over stop lines since the run began.
+        (Z,) vehicles on each link, and since the run began (Z,) that have come onto it, (L,) left over stop lines, (Z,)
+        left amid it.
         """
         if time_s % self._step_s == 0:
             # What is counted on from is never handed out: a foreign execution may write into it.
-            return np.maximum(self._x_veh, 0.0), self._entered_veh.copy(), self._left_veh.copy()
+            there, gone = np.maximum(self._x_veh, 0.0), (self._left_veh.copy(), self._parted_veh.copy())
+            return there, self._entered_veh.copy(), *gone
         came, left = self._entries.read(self._counted), self._exits.read(self._counted)
-        counted: tuple[Floats, Floats, Floats] = _counted(
-            came, left, self._x_veh, self._entered_veh, self._left_veh, self._set_link
+        counted: tuple[Floats, Floats, Floats, Floats] = _counted(
+            came, left, self._x_veh, self._entered_veh, self._left_veh, self._parted_veh, self._set_link
         )
         if time_s >= self._compared_s + COMPARED_S:
             self._compare(counted[0])
@@ -205,7 +211,9 @@ class Eyes:
         """Have the machine code made now, not at the first decision."""
         self._entries.read(lambda _: 0)
         left = np.zeros(self._sets + self._links)
-        _counted(self._x_veh, left, self._x_veh, self._entered_veh, self._left_veh, self._set_link)
+        _counted(
+            self._x_veh, left, self._x_veh, self._entered_veh, self._left_veh, self._parted_veh, self._set_link
+        )  # fmt: skip
 
 
 class _Detectors:
@@ -254,14 +262,14 @@ def _added(seen: Floats, junction: Ints, asked: Bools, place: Ints, places: int)
 
 @compiled
 def _counted(
-    came: Floats, left: Floats, x: Floats, entered: Floats, over: Floats, set_link: Ints
-) -> tuple[Floats, Floats, Floats]:
+    came: Floats, left: Floats, x: Floats, entered: Floats, over: Floats, parted: Floats, set_link: Ints
+) -> tuple[Floats, Floats, Floats, Floats]:
     """As Eyes.counted_veh, by who has `left` (L + Z,) over stop lines and amid links since the control step began."""
     sets = len(over)
     now, total = x + came - left[sets:], over + left[:sets]
     for lane_set, link in enumerate(set_link):
         now[link] -= left[lane_set]
-    return np.maximum(now, 0.0), entered + came, total
+    return np.maximum(now, 0.0), entered + came, total, parted + left[sets:]
 
 
 class Sight:
@@ -320,6 +328,11 @@ class Sight:
         """(L,) vehicles that have left over the stop line of each lane set since the run began."""
         return self._counted_veh[2]
 
+    @property
+    def parted_veh(self) -> Floats:
+        """(Z,) vehicles that have left each link amid it since the run began."""
+        return self._counted_veh[3]
+
     @cached_property
-    def _counted_veh(self) -> tuple[Floats, Floats, Floats]:
+    def _counted_veh(self) -> tuple[Floats, Floats, Floats, Floats]:
         return self._eyes.counted_veh(self.time_s)
