@@ -8,6 +8,7 @@ right, ahead, left from the north, then from the east, the south and the west.
 from __future__ import annotations
 
 import gzip
+import math
 import subprocess
 from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
@@ -479,6 +480,37 @@ def carriageways(
     flows = "".join(
         flow(f"f{place}", start, end, end=end_s - 60, period=f"exp({rate / 3600:.5f})", departLane="best")
         for place, (start, end, rate) in enumerate(ways)
+    )
+    return case(folder, flows, end=str(end_s))
+
+
+def ring(folder: Path, arm_veh_h: float = 300, end_s: int = 300) -> Path:
+    """A ring of two lanes and four arms, with signals where they come onto it: half of its traffic leaves before."""
+    streets = Streets()
+    for arm in range(4):
+        for name, degrees, radius_m, kind in (
+            (f"x{arm}", 90 * arm - 18, 45, "priority"),
+            (f"e{arm}", 90 * arm + 18, 45, "traffic_light"),
+            (f"O{arm}", 90 * arm - 2, ARM_M, "priority"),
+            (f"I{arm}", 90 * arm + 2, ARM_M, "priority"),
+        ):
+            angle = math.radians(degrees)
+            streets.node(name, round(radius_m * math.cos(angle), 1), round(radius_m * math.sin(angle), 1), kind)
+        for start, end in ((f"I{arm}", f"e{arm}"), (f"x{arm}", f"O{arm}"), (f"x{arm}", f"e{arm}")):
+            streets.one_way(start, end, 2)
+        streets.one_way(f"e{arm}", f"x{(arm + 1) % 4}", 2)
+    streets.net(folder, NO_TURNAROUNDS)
+    flows = "".join(
+        flow(
+            f"f{arm}{turn}",
+            f"I{arm}-e{arm}",
+            f"x{(arm + turn) % 4}-O{(arm + turn) % 4}",
+            end=end_s - 60,
+            period=f"exp({arm_veh_h / 3 / 3600:.5f})",
+            departLane="best",
+        )
+        for arm in range(4)
+        for turn in (1, 2, 3)
     )
     return case(folder, flows, end=str(end_s))
 
@@ -965,6 +997,7 @@ CASES: tuple[Callable[[Path], Path], ...] = (
     turning_pockets,
     side_streets,
     carriageways,
+    ring,
     roundabout,
     dead_ends,
     left_hand,

@@ -483,3 +483,9 @@ def test_left_turns_between_two_carriageways_are_let_out_before_the_next_want_in
     delay = delays_s(file, ("actuated", "delay_based", "recommended"), tmp_path)
     # They stand where no road's detectors see them: schedules went on with a green in which one of each side comes in.
     assert delay["recommended"] < min(delay["actuated"], delay["delay_based"])
+
+
+def test_on_a_ring_with_signals_nobody_waits_for_who_leaves_it_before(tmp_path: Path) -> None:
+    file = str(odd_nets.ring(tmp_path, end_s=1500))
+    delay = delays_s(file, ("actuated", "delay_based", "recommended"), tmp_path)
+    assert delay["recommended"] < min(delay["actuated"], delay["delay_based"])

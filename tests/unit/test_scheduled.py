@@ -1130,6 +1130,25 @@ class TestExecution:
         weigh(302.0, 0.0)
         assert weigh(332.0, 3.0) == pytest.approx(np.full(count, 1.125))
 
+    @pytest.mark.parametrize("is_full", [False, True])
+    def test_onto_a_full_ring_whoever_comes_from_outside_is_held_back_and_whoever_is_on_it_is_not(
+        self, is_full: bool, street_of: Callable[[Callable[[Path], Path]], Network]
+    ) -> None:
+        network = street_of(odd_nets.ring)
+        streams = Streams(network)
+        worth = Worth(network, streams, crowding=0.0, blocking=0.0, starving=0.0, full=1.0)
+        shares, all_of_them = streams.shares(network.fraction), np.ones(len(network.junctions), dtype=bool)
+        # However long the queues outside are, they are in nobody's way there.
+        x_veh = np.where(network.is_source, 0.8, 0.8 * is_full) * network.storage_veh
+        zones = np.zeros((len(network.lane_sets), len(ZONES_M))), np.zeros((len(network.links), len(ZONES_M)))
+        most, none = np.ones(len(streams.link)), np.zeros(len(streams.link), dtype=bool)
+        for now_s in np.arange(0.0, 600.0, 2.0):
+            found = worth.look(now_s, all_of_them, zones, x_veh, shares, most, none, np.ones(len(network.groups)))[0]
+        outside = network.is_source[streams.link]
+        assert (outside.sum(), (~outside).sum()) == (4, 4)
+        assert found[~outside] == pytest.approx(1.0)
+        assert found[outside] == pytest.approx(0.05 if is_full else 1.0)
+
     @pytest.mark.parametrize(
         ("goes", "stands", "stays"), [(False, True, False), (True, True, True), (False, False, True)]
     )

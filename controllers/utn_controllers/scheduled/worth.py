@@ -56,6 +56,9 @@ class Worth:
         """(L,) vehicles that were on the lanes of each set in sight when somebody looked last."""
         self._wide = np.array([link.lanes > 1 for link in network.links], dtype=np.bool_)
         """(Z,) links of which one lane may be full and another one empty."""
+        ways = [len(np.unique(network.turn_next[network.turn_link == link])) for link in streams.link]
+        self._only = np.array(ways) == 1
+        """(N,) streams of links all of whose traffic goes on to the same one."""
         self._late = np.zeros(len(network.links))
         """(Z,) share of their storage that has been taken of late."""
         self._time_s = 0.0
@@ -94,8 +97,8 @@ class Worth:
         )
         worth, moving = _worth(
             x, network.storage_veh, self._merged, fullest, self._dense, network.begins_amid, streams.link,
-            streams.lane_set, streams.group, streams.next_link, shares.of_link, shares.of_set, self._wide, self._late,
-            time_s - self._time_s, most, stuck, held, time_s, self._empty_s, *self._settings,
+            streams.lane_set, streams.group, streams.next_link, shares.of_link, shares.of_set, self._wide, self._only,
+            self._late, time_s - self._time_s, most, stuck, held, time_s, self._empty_s, *self._settings,
         )  # fmt: skip
         self._time_s = time_s
         return worth, moving
@@ -145,9 +148,9 @@ def _lasts(dense: Floats) -> Floats:
 @compiled
 def _worth(
     x: Floats, storage: Floats, merged: Bools, fullest: Floats, dense: Floats, amid: Bools, links: Ints, sets: Ints,
-    groups: Ints, next_links: Ints, of_link: Floats, of_set: Floats, wide: Bools, late: Floats, ago_s: float,
-    most: Floats, stuck: Bools, held: Floats, time_s: float, empty_s: Floats, crowding: float, blocking: float,
-    starving: float, full: float,
+    groups: Ints, next_links: Ints, of_link: Floats, of_set: Floats, wide: Bools, only: Bools, late: Floats,
+    ago_s: float, most: Floats, stuck: Bools, held: Floats, time_s: float, empty_s: Floats, crowding: float,
+    blocking: float, starving: float, full: float,
 ) -> tuple[Floats, Floats]:  # fmt: skip
     queue, taken = _lasts(dense), x / storage
     feeding, behind = amid.astype(np.float64), np.zeros(len(x))
@@ -160,7 +163,7 @@ def _worth(
             feeding[ahead] += of_link[stream]
             behind[ahead] += of_link[stream] * queue[sets[stream]]
     late += (1 - np.exp(-ago_s / LASTING_S)) * (taken - late)
-    back = _held_back(np.minimum(taken, late), feeding, wide, links, sets, next_links, of_set, len(dense))
+    back = _held_back(np.minimum(taken, late), feeding, wide, only, links, sets, next_links, of_set, len(dense))
     worth, moving = np.empty(len(links)), most.copy()
     for stream, ahead in enumerate(next_links):
         link = links[stream]
@@ -185,18 +188,22 @@ def _worth(
 
 @compiled
 def _held_back(
-    taken: Floats, feeding: Floats, wide: Bools, links: Ints, sets: Ints, next_links: Ints, of_set: Floats, count: int
-) -> Floats:
+    taken: Floats, feeding: Floats, wide: Bools, only: Bools, links: Ints, sets: Ints, next_links: Ints,
+    of_set: Floats, count: int,
+) -> Floats:  # fmt: skip
     """(L,) of each lane set's traffic the share that should not go on yet, so that the others have to wait with it.
 
     Green for who turns elsewhere lets in whoever shares his lanes. Where all links of a circuit have a lane full to its
     beginning, each lets go only when the next one does: who comes from outside waits there, where he is in nobody's
     way, and whoever would go onto a road of several lanes, of which one is full while others are empty. A single lane
-    is far from full by then, and who has to wait before it would soon fill a short block. `taken` (Z,) are shares of
-    the links' storage.
+    is far from full by then, and who has to wait before it would soon fill a short block. Nor is anybody held back on a
+    full road amid the net that leads nowhere else (`only`, N): on a ring with signals all have to go on, so that some
+    can leave it, and who is not yet on it waits for them. `taken` (Z,) are shares of the links' storage.
     """
     back = np.zeros(count)
     for stream, ahead in enumerate(next_links):
-        if ahead != EXIT and (wide[ahead] or feeding[links[stream]] == 0):
-            back[sets[stream]] += of_set[stream] * between(taken[ahead], HOLDING_BACK)
+        link = links[stream]
+        if ahead != EXIT and (wide[ahead] or feeding[link] == 0):
+            on_it = between(taken[link], HOLDING_BACK) if only[stream] and feeding[link] > 0 else 0.0
+            back[sets[stream]] += of_set[stream] * between(taken[ahead], HOLDING_BACK) * (1 - on_it)
     return back
