@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import ZONES_M, Floats, Network
 
 MEMORY_S = 300.0
@@ -28,20 +29,32 @@ class Parting:
         self._is_any = bool(self._ahead.any())
         self._came_veh, self._off_veh = np.zeros((2, len(network.links)))
         """(Z,) that came of late, and that turned off."""
-        self._before = np.zeros((2, len(network.links)))
+        self._came_before, self._off_before = np.zeros((2, len(network.links)))
         self.onward = np.ones_like(self._ahead)
         """(Z, zones + 1) share of those in each zone of a link who come to its stop line, then of those farther off."""
 
     def look(self, entered_veh: Floats, parted_veh: Floats) -> None:
         """A bin has gone by; so many (Z,) have come onto each link since the run began, and left it amid it."""
-        if not self._is_any:
-            return
-        came, off = entered_veh - self._before[0], parted_veh - self._before[1]
-        self._before = np.array([entered_veh, parted_veh])
-        self._came_veh = self._fading * self._came_veh + came
-        self._off_veh = self._fading * self._off_veh + off
-        share = np.minimum(self._off_veh / (self._came_veh + KNOWN_VEH), 1.0)
-        self.onward = 1 - share[:, None] * self._ahead
+        if self._is_any:
+            _look(
+                entered_veh, parted_veh, self._came_before, self._off_before, self._fading, self._came_veh,
+                self._off_veh, self._ahead, self.onward,
+            )  # fmt: skip
+
+
+@compiled
+def _look(
+    entered: Floats, parted: Floats, came_before: Floats, off_before: Floats, fading: float, came: Floats, off: Floats,
+    ahead: Floats, onward: Floats,
+) -> None:  # fmt: skip
+    """Brings who `came` (Z,), who turned `off` (Z,) and who goes `onward` (Z, zones + 1) up to date."""
+    for link in range(len(came)):
+        came[link] = fading * came[link] + (entered[link] - came_before[link])
+        off[link] = fading * off[link] + (parted[link] - off_before[link])
+        came_before[link], off_before[link] = entered[link], parted[link]
+        share = min(off[link] / (came[link] + KNOWN_VEH), 1.0)
+        for place in range(ahead.shape[1]):
+            onward[link, place] = 1 - share * ahead[link, place]
 
 
 def _ahead(length_m: float, parting_m: tuple[float, ...]) -> Floats:
