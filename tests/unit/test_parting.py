@@ -29,7 +29,7 @@ def sides(street_of: Callable[[Callable[[Path], Path]], Network]) -> Network:
 
 def with_one_place(network: Network, link: int, place_m: float) -> Network:
     """The network with that link's traffic parting at one place, so far before the stop line, and no other's."""
-    links = [replace(each, parting=(), parting_m=()) for each in network.links]
+    links = [replace(each, joining=(), parting=(), parting_m=()) for each in network.links]
     links[link] = replace(links[link], parting=(":n_0_0", ":n_1_0"), parting_m=(place_m, place_m))
     return replace(network, links=tuple(links))
 
@@ -67,6 +67,13 @@ def test_whoever_is_past_the_place_comes_and_of_those_before_it_as_many_as_did_o
         assert 1 - onward == pytest.approx(0.4 * np.array(of_zones), rel=0.03)
         # Nobody turns off elsewhere.
         assert (np.delete(parting.onward, link, axis=0) == 1).all()
+
+
+def test_where_others_come_onto_the_link_amid_it_they_come_instead(sides: Network) -> None:
+    link = sides.link_index("u-B")
+    assert sides.links[link].joining
+    assert sides.links[link].parting_m
+    assert (after(Parting(sides, BIN_S), of(sides, link), 1.0, 0.4) == 1).all()
 
 
 def test_it_is_learnt_anew_where_others_come_to_turn_off(sides: Network) -> None:

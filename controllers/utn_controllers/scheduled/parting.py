@@ -1,8 +1,10 @@
 """Who turns off amid a link, at nodes without signals, and never comes to its stop line.
 
-On a ring with signals where roads come onto it half of all do that left the signal before, and before a signal behind
-side streets some. To wait for them would draw out greens for nobody. Loops count who comes onto a link and who leaves
-it amid it; as many will as did of late.
+On a ring with signals where roads come onto it half of all do that left the signal before. To wait for them would draw
+out greens for nobody. Loops count who comes onto a link and who leaves it amid it; as many will as did of late.
+
+Not where others come onto the link amid it as well: these arrive instead, and who waits there for a gap finds one in
+what longer greens let go, not in short ones.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ class Parting:
 
     def __init__(self, network: Network, bin_s: float):
         self._fading = 1 - bin_s / MEMORY_S
-        self._ahead = np.array([_ahead(link.length_m, link.parting_m) for link in network.links])
+        self._ahead = np.array(
+            [_ahead(link.length_m, () if link.joining else link.parting_m) for link in network.links]
+        )
         """(Z, zones + 1) of the places at which a link's traffic parts the share that is ahead in each zone, then of
         those farther off."""
         self._is_any = bool(self._ahead.any())
