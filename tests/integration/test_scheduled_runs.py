@@ -251,7 +251,7 @@ def waits_s(folder: Path, prefix: str) -> list[float]:
 def test_far_over_capacity_each_arm_has_green_once_before_any_a_second_time(
     main_every_s: float, side_every_s: float, tmp_path: Path
 ) -> None:
-    file = odd_nets.arm_by_arm(tmp_path, main_every_s=main_every_s, side_every_s=side_every_s, end_s=1800)
+    file = odd_nets.arm_by_arm(tmp_path, main_every_s=main_every_s, side_every_s=side_every_s, end_s=2100)
     result = bridge.run(scenario(net=str(file), controller="recommended"), tmp_path / "out")
     assert_safe(result)
     states = monitor.read_switches(tmp_path / "out" / "signals.xml")["C"]

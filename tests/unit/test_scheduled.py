@@ -33,6 +33,7 @@ from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.gaps import Gaps
 from utn_controllers.scheduled.moves import Moves, Rules, going
 from utn_controllers.scheduled.programme import schedules
+from utn_controllers.scheduled.regret import NEEDLESS
 from utn_controllers.scheduled.streams import Streams
 from utn_controllers.scheduled.worth import Worth
 from utn_sumo import streets
@@ -79,6 +80,8 @@ class Crossing:
     """The stage led to in the bin after that of the last decision, as it foresaw."""
     last: int = field(default=-1, init=False)
     """The row that the schedule of the last decision ends with."""
+    regret: float = field(default=-1.0, init=False)
+    """What it has cost to stay until then."""
 
     def green(self) -> Floats:
         """(S, N) share of its discharge that each stream has in each stage."""
@@ -155,15 +158,16 @@ class Crossing:
         plan: Ints | None = None,
         sent: Floats | None = None,
         shown_s: Sequence[float] | None = None,
+        regret: float = np.inf,
     ) -> tuple[int, Floats]:
         """The stage led to, and (N, K) what is sent off; `plan` (K,) is the schedule of the bin before.
 
-        By turns if it is said when stages were shown.
+        By turns if it is said when stages were shown; what is best unless it is said that nothing is regretted yet.
         """
         stages = len(self.clearance)
         plan = np.zeros(self.bins, dtype=np.int64) if plan is None else plan
         sent = np.zeros((stages, self.bins)) if sent is None else sent.copy()
-        shown = plan[None].copy()
+        shown, regrets = plan[None].copy(), np.array([regret])
         wish, then = schedules(
             np.array([stage]),
             np.array([free]),
@@ -179,9 +183,10 @@ class Crossing:
             sent,
             np.array([shown_s is not None]),
             np.zeros(stages) if shown_s is None else np.array(shown_s),
+            regrets,
         )
         assert wish[0] in (stage, then[0])
-        self.then, self.last = int(then[0]), int(shown[0, -1])
+        self.then, self.last, self.regret = int(then[0]), int(shown[0, -1]), float(regrets[0])
         return int(wish[0]), sent
 
     def begins(self, stand: object, come: Floats, most: object = 1.0) -> list[tuple[int, int, Floats]]:
@@ -407,6 +412,48 @@ class TestProgramme:
         assert kept.decide(stand, worth=worth)[0] == 0
         # Green is not as good as that for who waits for gaps in it.
         assert replace(kept, waits={(1, 1): 0.2}).decide(stand, worth=worth)[0] == 1
+
+    def likely(self, *, veh: float, clearance: int) -> tuple[Crossing, Floats]:
+        """A junction to whose second stage so many come soon, by chance, and nobody to the first."""
+        crossing = Crossing((clearance,) * 2, (1, 1), bins=16)
+        come = np.zeros((2, crossing.bins))
+        come[1, clearance] = veh
+        return crossing, come
+
+    @pytest.mark.parametrize("clearance", [2, 5])
+    def test_a_change_for_those_who_may_come_waits_until_not_to_change_has_cost_as_much(self, clearance: int) -> None:
+        crossing, come = self.likely(veh=0.1, clearance=clearance)
+        assert crossing.decide(0.0, come)[0] == 1
+        stays, regret, most = 0, 0.0, NEEDLESS * clearance**2
+        while crossing.decide(0.0, come, regret=regret)[0] == 0:
+            # Led on in the bin's midst it would hardly have stayed.
+            assert crossing.then == 0
+            assert regret < crossing.regret < most
+            stays, regret = stays + 1, crossing.regret
+        # A tenth of one waits a bin longer each time: it stays as long as that is below what it may cost.
+        assert stays == np.ceil(most / 0.1) - 1
+        assert crossing.regret == 0.0
+
+    @pytest.mark.parametrize("clearance", [2, 5])
+    @pytest.mark.parametrize("stand", [(0.0, 1.0), (0.0, 3.0)])
+    def test_a_change_for_somebody_who_is_seen_to_wait_comes_at_once(
+        self, clearance: int, stand: tuple[float, float]
+    ) -> None:
+        crossing, come = self.likely(veh=0.1, clearance=clearance)
+        assert crossing.decide(stand, come, regret=0.0)[0] == 1
+
+    @pytest.mark.parametrize("clearance", [2, 5])
+    def test_a_change_for_somebody_who_will_be_there_when_it_is_over_comes_at_once(self, clearance: int) -> None:
+        crossing, come = self.likely(veh=0.1, clearance=clearance)
+        come[1, clearance - 1] = 1.0
+        assert crossing.decide(0.0, come, regret=0.0)[0] == 1
+
+    def test_what_it_has_cost_to_stay_is_forgotten_with_nobody_left_to_change_for(self) -> None:
+        crossing, come = self.likely(veh=0.1, clearance=5)
+        crossing.decide(0.0, come, regret=0.0)
+        assert crossing.regret > 0
+        assert crossing.decide(0.0, 0.001 * come, regret=crossing.regret)[0] == 0
+        assert crossing.regret == 0.0
 
     def test_with_nobody_anywhere_the_present_stage_stays(self) -> None:
         for stage in range(3):

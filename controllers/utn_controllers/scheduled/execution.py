@@ -109,6 +109,8 @@ class Scheduled:
         """(J, K) the last schedules, of each junction as far as they go."""
         self._sent_veh = np.zeros((len(self._calling.letters), bins))
         """(A, K) what each stream sends off by them."""
+        self._regret = np.zeros(len(network.junctions))
+        """(J,) what it has cost so far not to have changed for nobody, in vehicles and bins."""
         self._row = np.argsort(stages)
         """(S,) row of the rules in which each of the network's stages is."""
         self._due: list[tuple[int, int]] = []
@@ -165,6 +167,7 @@ class Scheduled:
             self._sent_veh,
             by_turns,
             self._rounds.shown_s,
+            self._regret,
         )
         outlook.sent_veh = self._sent_veh[self._calling.motors]
         self._due = [(index, int(then[index])) for index in (then != wish).nonzero()[0].tolist()]

@@ -15,6 +15,7 @@ import numpy as np
 
 from utn_controllers.scheduled.gaps import Gaps, begin_green, clear, let_go
 from utn_controllers.scheduled.moves import Rules
+from utn_controllers.scheduled.regret import forborne
 from utn_controllers.scheduled.rounds import in_turn
 from utn_controllers.scheduled.traffic import Traffic
 from utn_sumo.compiling import compiled, inlined
@@ -33,11 +34,11 @@ ALIKE = 1e-9
 @compiled
 def schedules(
     stage: Ints, free: Bools, rest: Ints, rules: Rules, stand: Floats, come: Floats, worth: Floats, ends: Floats,
-    kept: Floats, most: Floats, plan: Ints, sent: Floats, by_turns: Bools, shown_s: Floats,
+    kept: Floats, most: Floats, plan: Ints, sent: Floats, by_turns: Bools, shown_s: Floats, regret: Floats,
 ) -> tuple[Ints, Ints]:  # fmt: skip
     """(J,) what each junction that is `free` does in this bin: the stage to lead to, or the present `stage` (J,).
 
-    And (J,) the same of the next bin, as far as it is foreseen.
+    And (J,) the same of the next bin, as far as it is foreseen: not where it would have changed, and stays.
 
     `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
     weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `kept` (N,) of one that has green then
@@ -50,6 +51,9 @@ def schedules(
     not free, what is left of the last one.
 
     Junctions that go `by_turns` (J,) show that stage next which was shown longest ago, at `shown_s` (S,).
+
+    `regret` (J,) is what it has cost so far to stay where a schedule began with a change that nobody was seen to need,
+    and is kept up to date.
     """
     wish, then = stage.copy(), stage.copy()
     for junction in range(len(stage)):
@@ -69,18 +73,18 @@ def schedules(
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, rules.gaps, stand[a:b], come[a:b, :bins].copy(),
                 worth[a:b], ends[a:b], kept[a:b], most[a:b], plan[junction, :bins], goes, by_turns[junction],
-                shown_s[low : low + stages],
+                shown_s[low : low + stages], regret[junction : junction + 1],
             )  # fmt: skip
         else:
             chosen = _schedule(
                 present, rest[junction], low, stages, rules, None, stand[a:b], come[a:b, :bins].copy(), worth[a:b],
                 ends[a:b], kept[a:b], most[a:b], plan[junction, :bins], goes, by_turns[junction],
-                shown_s[low : low + stages],
+                shown_s[low : low + stages], regret[junction : junction + 1],
             )  # fmt: skip
         sent[a:b, :bins] = goes
         wish[junction] = rules.stages[low + chosen]
         then[junction] = wish[junction]
-        if chosen == present and plan[junction, 1] != low + present:
+        if chosen == present and plan[junction, 1] != low + present and regret[junction] == 0:
             for row in plan[junction, 1:]:
                 if low <= row < low + stages:
                     then[junction] = rules.stages[row]
@@ -92,12 +96,14 @@ def schedules(
 def _schedule(
     present: int, rest: int, low: int, stages: int, rules: Rules, gaps: Gaps | None, stand: Floats, come: Floats,
     worth: Floats, ends: Floats, kept: Floats, most: Floats, plan: Ints, sent: Floats, by_turns: bool, shown_s: Floats,
+    regret: Floats,
 ) -> int:  # fmt: skip
     """The stage that one junction leads to in this bin, the `present` one if it stays, by rows from `low` on.
 
     `gaps` None says that nobody waits for any: the machine code for that is another, and quicker.
     """
     chosen = present
+    before, regret[0] = regret[0], 0.0
     called = _called(present, low, stages, rules, stand, come)
     if called.any():
         after = rules.follows[low : low + stages, :stages] & called & ~np.eye(stages, dtype=np.bool_)
@@ -111,6 +117,19 @@ def _schedule(
             chosen = _search(present, rest, low, after, rules, gaps, traffic, limit, plan)
             if chosen >= 0:
                 break
+        if chosen != present and rest > 0:
+            row = low + present
+            gives_way, clearance = rules.gaps.waiting[row], rules.clearance[row, chosen]
+            may_cost = forborne(stand, traffic.came, worth, rules.moves[row], gives_way, clearance) - before
+            if may_cost > 0:
+                _send_off(plan, rules, gaps, stand, come, most, sent)
+                known = _waited(sent, traffic, plan[-1], low, stages, rules)
+                staying = plan.copy()
+                if _search(present, rest, low, after, rules, gaps, traffic, known + may_cost, staying, 1) == present:
+                    chosen, plan[:] = present, staying
+                    _send_off(plan, rules, gaps, stand, come, most, sent)
+                    waited = _waited(sent, traffic, plan[-1], low, stages, rules)
+                    regret[0] = before + max(waited - known, ALIKE)
     else:
         plan[:] = low + present
     _send_off(plan, rules, gaps, stand, come, most, sent)
@@ -138,11 +157,11 @@ def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, co
 @compiled
 def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for the compiler
     present: int, rest: int, low: int, after: Bools, rules: Rules, gaps: Gaps | None, traffic: Traffic, limit: float,
-    plan: Ints,
+    plan: Ints, soonest: int = 0,
 ) -> int:  # fmt: skip
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more.
 
-    `after` (s, s) has which stage may come after each.
+    `after` (s, s) has which stage may come after each; the present one ends in the bin `soonest` or later.
     """
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
     ends, due = traffic.ends, traffic.due
@@ -179,7 +198,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                 if after[stage, other]:
                     others[nexts], nexts = other, nexts + 1
                     lose = 0 if clearing[row, other] >= 0 else min(lose, clearance[row, other])
-            may_end, must_end = (begin + least[row], bins) if begin > 0 else (0, rest)
+            may_end, must_end = (begin + least[row], bins) if begin > 0 else (soonest, rest)
             now, goes = begin, True
             if gaps is not None:
                 begin_green(row, gaps, begin == 0, pace, free, to_come)
