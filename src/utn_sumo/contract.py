@@ -638,6 +638,9 @@ class Measurement:
     """(G,) in the lane-area detectors on the lanes of each lane group at the end, moving or not."""
     beside_veh: Floats
     """(Z,) counted onto the link amid it over the loops at side roads, less those counted off it."""
+    uncounted_veh: Floats
+    """(Z,) found on the link during the step and not counted onto it, less those counted and not to be found: of an
+    execution that asks who is there (View.x_veh)."""
     seen_veh: Floats
     """(Z,) in the lane-area detectors at the end, moving or not."""
     entry_occupancy: Floats

@@ -114,7 +114,7 @@ class Estimator:
     def _count(self, seen: Measurement, entered_veh: Floats) -> None:
         """X by the Kalman filter: counted on, and held against what is seen where the road is free."""
         left = self._by_link(seen.turned_veh)
-        entered_veh = entered_veh + seen.beside_veh
+        entered_veh = entered_veh + seen.beside_veh + seen.uncounted_veh
         x = self._x_veh + entered_veh - (1 - self._bias) * left + self._usual_veh
         move = np.tile(np.eye(3), (len(x), 1, 1))
         move[:, 0, 1], move[:, 0, 2] = left, 1.0
@@ -140,7 +140,7 @@ class Estimator:
         self._x_veh = np.clip(x + gain[:, 0] * residual, seen.seen_veh, seen.seen_veh + unwatched_veh)
         self._disturbance_veh = seen.beside_veh.copy()
         if self._disturbance_variance > 0:
-            self._disturbance_veh += self._x_veh - before - entered_veh + (1 - self._bias) * left
+            self._disturbance_veh += seen.uncounted_veh + self._x_veh - before - entered_veh + (1 - self._bias) * left
 
     def _crowded(self, seen: Measurement) -> Floats:
         """(Z,) share of the room in view that is taken, where it is most: one lane may be full beside an empty one."""

@@ -48,7 +48,7 @@ def counted(net: Network, *, entered: Floats | None = None, **readings: Floats) 
     links = each(net, 0.0)
     entered = links if entered is None else entered
     samples = entered if entered.ndim == 2 else over_step(net, entered)
-    rest = dict.fromkeys(("queue_veh", "seen_veh", "beside_veh", "stop_line_occupancy"), links)
+    rest = dict.fromkeys(("queue_veh", "seen_veh", "beside_veh", "uncounted_veh", "stop_line_occupancy"), links)
     rest["group_queue_veh"] = np.zeros(len(net.groups))
     # One lane group a link.
     rest["group_seen_veh"] = np.asarray(readings.get("seen_veh", links))[net.group_link]

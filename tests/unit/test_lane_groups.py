@@ -117,7 +117,7 @@ def counted(net: Network, **readings: Floats) -> Measurement:
     """What is not given is zero."""
     links, samples = np.zeros(len(net.links)), np.zeros((net.samples, len(net.links)))
     nothing: dict[str, Any] = dict.fromkeys(
-        ("queue_veh", "seen_veh", "beside_veh", "entry_occupancy", "stop_line_occupancy"), links
+        ("queue_veh", "seen_veh", "beside_veh", "uncounted_veh", "entry_occupancy", "stop_line_occupancy"), links
     )
     nothing |= {"entered_veh": samples, "turned_veh": np.zeros(len(net.turns))}
     return Measurement(

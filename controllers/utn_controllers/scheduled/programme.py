@@ -111,8 +111,7 @@ def _schedule(
             after &= in_turn(called, present, shown_s)
         traffic = _sums(rules.moves[low : low + stages], stand, come, worth, ends, kept, most)
         # What was best a bin ago is seldom far from what is best now.
-        _send_off(plan, rules, gaps, stand, come, most, sent)
-        known = _waited(sent, traffic, plan[-1], low, stages, rules)
+        known = _leads_to(plan, low, stages, rules, gaps, traffic, sent)
         for limit in (known + ALIKE * (2 + known), NEVER):
             chosen = _search(present, rest, low, after, rules, gaps, traffic, limit, plan)
             if chosen >= 0:
@@ -122,13 +121,11 @@ def _schedule(
             gives_way, clearance = rules.gaps.waiting[row], rules.clearance[row, chosen]
             may_cost = forborne(stand, traffic.came, worth, rules.moves[row], gives_way, clearance) - before
             if may_cost > 0:
-                _send_off(plan, rules, gaps, stand, come, most, sent)
-                known = _waited(sent, traffic, plan[-1], low, stages, rules)
+                known = _leads_to(plan, low, stages, rules, gaps, traffic, sent)
                 staying = plan.copy()
                 if _search(present, rest, low, after, rules, gaps, traffic, known + may_cost, staying, 1) == present:
                     chosen, plan[:] = present, staying
-                    _send_off(plan, rules, gaps, stand, come, most, sent)
-                    waited = _waited(sent, traffic, plan[-1], low, stages, rules)
+                    waited = _leads_to(plan, low, stages, rules, gaps, traffic, sent)
                     regret[0] = before + max(waited - known, ALIKE)
     else:
         plan[:] = low + present
@@ -416,8 +413,12 @@ def _lead(
 
 
 @compiled
-def _waited(sent: Floats, traffic: Traffic, last: int, low: int, stages: int, rules: Rules) -> float:
-    """What is waited where so much is `sent` off (n, K) and the `last` row of the moves is shown at the end."""
+def _leads_to(
+    plan: Ints, low: int, stages: int, rules: Rules, gaps: Gaps | None, traffic: Traffic, sent: Floats
+) -> float:  # fmt: skip
+    """What is waited by a `plan`, and into `sent` (n, K) what it sends off."""
+    _send_off(plan, rules, gaps, traffic.stand, traffic.come, traffic.most, sent)
+    last = plan[-1]
     total, green = 0.0, low <= last < low + stages
     for stream in range(len(sent)):
         veh, waited = traffic.stand[stream], 0.0

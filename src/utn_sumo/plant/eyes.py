@@ -16,6 +16,7 @@ from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.buttons import Buttons
 from utn_sumo.plant.functions import bare
 from utn_sumo.plant.heads import Heads
+from utn_sumo.plant.hidden import Hidden
 
 COMPARED_S = 10.0
 """Time between two looks at whether as many can be on a link as are counted."""
@@ -42,6 +43,7 @@ class Eyes:
         self._zones = detectors(
             list(chain.from_iterable([*ids.set_zone, *ids.upstream_zone])), np.repeat(by_set, len(ZONES_M))
         )
+        self._far = detectors(_farthest(network, ids), network.link_junction)
         self._entries = detectors(
             [(*a, *b) for a, b in zip(ids.entry, ids.joining, strict=True)], network.link_junction
         )
@@ -73,10 +75,9 @@ class Eyes:
         self._since_s = bare(sumo, "inductionloop", "getTimeSinceDetection")
         self._x_veh = np.zeros(self._links)
         """(Z,) vehicles on each link when the control step began."""
-        self._unseen_veh = network.storage_veh - network.watched_veh
-        """(Z,) vehicles that fit on what the lane-area detectors do not see of each link."""
-        self._lanes = np.array([link.lanes for link in network.links], dtype=np.float64)
-        """(Z,) one a lane may be seen who is not counted yet, or no more."""
+        self._hidden = Hidden(network, np.array([*map(any, zip(ids.joining, ids.parting, strict=True))]))
+        self.uncounted_veh = np.zeros(self._links)
+        """(Z,) of contract.Measurement, in the control step under way."""
         self._compared_s = -np.inf
         """When what is counted was last held against what is seen."""
         self._entered_veh = np.zeros(self._links)
@@ -91,6 +92,7 @@ class Eyes:
     def begin(self, time_s: float, x_veh: Floats) -> None:
         """A control step begins, with so many vehicles on each link (Z,)."""
         self._x_veh = np.array(x_veh, dtype=np.float64)
+        self.uncounted_veh = np.zeros(self._links)
         if time_s > 0:
             self._entered_veh = self._entered_veh + self._entries.read(self._counted_last)
             left = self._exits.read(self._counted_last)
@@ -102,7 +104,8 @@ class Eyes:
     def sumo_time_s(self) -> float:
         """Wall time so far inside SUMO's functions, in readings of many detectors at once."""
         readers = (
-            self._areas, self._zones, self._entries, self._exits, self._buttons, self._side_areas, self._side_lines
+            self._areas, self._zones, self._far, self._entries, self._exits, self._buttons, self._side_areas,
+            self._side_lines,
         )  # fmt: skip
         return sum(reader.sumo_time_s for reader in readers)
 
@@ -161,18 +164,17 @@ class Eyes:
         counted: tuple[Floats, Floats, Floats, Floats] = _counted(
             came, left, self._x_veh, self._entered_veh, self._left_veh, self._parted_veh, self._set_link
         )
+        x_veh, entered_veh = counted[:2]
+        self._hidden.note(time_s, entered_veh)
         if time_s >= self._compared_s + COMPARED_S:
-            self._compare(counted[0])
             self._compared_s = time_s
+            veh = self._areas.read(self._present)
+            seen_veh = np.bincount(self._set_link, veh[: self._sets], self._links) + veh[self._sets :]
+            can_be = self._hidden.correct(time_s, entered_veh, x_veh, seen_veh, self._far.read(self._present))
+            self._x_veh += can_be - x_veh
+            self.uncounted_veh += can_be - x_veh
+            x_veh[:] = can_be
         return counted
-
-    def _compare(self, x_veh: Floats) -> None:
-        """Bring what is known of who is on each link (Z,) to what can be: some start or end amid it, uncounted."""
-        veh = self._areas.read(self._present)
-        seen_veh = np.bincount(self._set_link, veh[: self._sets], self._links) + veh[self._sets :]
-        can_be = np.clip(x_veh, seen_veh - self._lanes, seen_veh + self._unseen_veh + self._lanes)
-        self._x_veh += can_be - x_veh
-        x_veh[:] = np.maximum(can_be, 0.0)
 
     def close_one_veh(self, lane_set: int) -> float:
         """In the zones up to CLOSE_ZONES of one lane set, and before its lanes part, moving or not."""
@@ -214,6 +216,14 @@ class Eyes:
         _counted(
             self._x_veh, left, self._x_veh, self._entered_veh, self._left_veh, self._parted_veh, self._set_link
         )  # fmt: skip
+
+
+def _farthest(network: Network, ids: DetectorIds) -> list[list[str]]:
+    """Detectors of the farthest zone of each link in sight, within which its lanes may part."""
+    far = [list(zones[-1]) for zones in ids.upstream_zone]
+    for link, zones in zip(network.set_link.tolist(), ids.set_zone, strict=True):
+        far[link] += zones[-1]
+    return far
 
 
 class _Detectors:

@@ -386,6 +386,7 @@ class SumoPlant:
             group_queue_veh=_total(area.getLastStepHaltingNumber, self._ids.group),
             group_seen_veh=_total(area.getLastStepVehicleNumber, self._ids.group),
             beside_veh=_total(counted, self._ids.joining) - _total(counted, self._ids.parting),
+            uncounted_veh=self._eyes.uncounted_veh,
             seen_veh=_total(area.getLastStepVehicleNumber, self._ids.area),
             entry_occupancy=occupancy(self._ids.entry),
             stop_line_occupancy=occupancy(self._ids.stop_line),

@@ -1,0 +1,94 @@
+"""How many vehicles are on each link, though no detector sees all of it and some start or end there uncounted.
+
+A count of who comes and who goes is wrong by these, and never forgets. But where traffic flows freely as far as it is
+seen, who came long enough ago is in sight by now, or gone, and only who came just now still is hidden. Where it does
+not, the link is taken to gain or lose as many of those who come as it did when that could be seen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from utn_sumo.contract import AREA_REACH_M, ZONES_M, Bools, Floats, Network
+
+FREE_SHARE = 0.25
+"""Share of its storage up to which the farthest zone in sight leaves those behind it moving freely."""
+SLOW = 1.5
+"""Over the time at free speed, that of the slowest."""
+LATE_S = 5.0
+"""And so much later they may come in sight, from a standing start."""
+NOTED_S = 2.0
+"""Time between two moments of which it is kept who had come."""
+KNOWN_VEH = 30.0
+"""After as many as these what a link gains or loses goes half by what was seen of it, half by nobody."""
+KEPT_SHARE = float(np.exp(-10 / 900))
+"""Of what was seen of that what is kept from one look to the next, where traffic flows freely: a quarter of an hour's
+worth, looking every ten seconds."""
+
+
+class Hidden:
+    """Brings a count of who is on each link to what can be."""
+
+    def __init__(self, network: Network, aside: Bools):
+        """`aside` (Z,) has the links onto or off which some go amid it, counted."""
+        length_m = np.array([link.length_m for link in network.links])
+        speed_m_s = np.array([link.free_speed_m_s for link in network.links])
+        self._free_s = np.maximum(length_m - AREA_REACH_M, 0.0) / speed_m_s
+        """(Z,) from entry to where sight begins."""
+        self._slow_s = SLOW * self._free_s + LATE_S
+        """(Z,) the same of the slowest."""
+        self._free_veh = FREE_SHARE * network.storage_veh * (ZONES_M[-1] - ZONES_M[-2]) / length_m
+        """(Z,) vehicles in the farthest zone up to which it flows freely."""
+        self._all_come = ~aside
+        """(Z,) whether who comes is still to come into sight, or in it."""
+        self._unseen_veh = network.storage_veh - network.watched_veh
+        """(Z,) vehicles that fit on what the lane-area detectors do not see of each link."""
+        self._lanes = np.array([link.lanes for link in network.links], dtype=np.float64)
+        """(Z,) one a lane may be seen who is not counted yet, or no more."""
+        moments = int(np.ceil(self._slow_s.max(initial=0.0) / NOTED_S)) + 2
+        self._noted_s = np.full(moments, -np.inf)
+        self._noted_veh = np.zeros((moments, len(network.links)))
+        """(moments, Z) vehicles that had come onto each link, in a ring."""
+        self._last = 0
+        self._gained, self._of = np.zeros((2, len(network.links)))
+        """(Z,) vehicles found on each link beyond those counted, of so many that came."""
+        self._gain_since, self._came_since = np.zeros((2, len(network.links)))
+        """(Z,) the same since traffic last flowed freely there."""
+        self._came_veh = np.zeros(len(network.links))
+
+    def note(self, time_s: float, came_veh: Floats) -> None:
+        """So many (Z,) have come onto each link by now."""
+        if time_s >= self._noted_s[self._last] + NOTED_S:
+            self._last = (self._last + 1) % len(self._noted_s)
+            self._noted_s[self._last], self._noted_veh[self._last] = time_s, came_veh
+
+    def correct(self, time_s: float, came_veh: Floats, x_veh: Floats, seen_veh: Floats, far_veh: Floats) -> Floats:
+        """(Z,) vehicles on each link, of `x_veh` (Z,) that were counted.
+
+        `came_veh` (Z,) have come by now, as in `note`; `seen_veh` (Z,) are in sight, `far_veh` (Z,) of them in the
+        farthest zone.
+        """
+        least_veh, most_veh = self._recent(time_s, came_veh)
+        free = far_veh <= self._free_veh
+        low = seen_veh + np.where(free, np.minimum(self._all_come * least_veh, self._unseen_veh), -self._lanes)
+        high = seen_veh + np.where(free, np.minimum(most_veh, self._unseen_veh), self._unseen_veh + self._lanes)
+        came = came_veh - self._came_veh
+        self._came_veh = came_veh.copy()
+        gain = np.clip(self._gained / (self._of + KNOWN_VEH), -1.0, 1.0)
+        can_be = np.clip(x_veh + gain * came, low, high)
+        self._gain_since += can_be - x_veh
+        self._came_since += came
+        self._gained[free] = KEPT_SHARE * self._gained[free] + self._gain_since[free]
+        self._of[free] = KEPT_SHARE * self._of[free] + self._came_since[free]
+        self._gain_since[free], self._came_since[free] = 0.0, 0.0
+        return np.asarray(np.maximum(can_be, 0.0))
+
+    def _recent(self, time_s: float, came_veh: Floats) -> tuple[Floats, Floats]:
+        """(Z,) who came within the time at free speed to where sight begins, (Z,) and within that of the slowest."""
+        oldest_first = np.roll(np.arange(len(self._noted_s)), -self._last - 1)
+        noted_s, links = self._noted_s[oldest_first], np.arange(len(came_veh))
+        # The first moment within the one time, and the last before the other.
+        first = oldest_first[np.minimum(np.searchsorted(noted_s, time_s - self._free_s), len(noted_s) - 1)]
+        last = oldest_first[np.maximum(np.searchsorted(noted_s, time_s - self._slow_s, side="right") - 1, 0)]
+        least, most = (came_veh - self._noted_veh[moment, links] for moment in (first, last))
+        return np.maximum(least, 0.0), np.maximum(most, 0.0)
