@@ -13,8 +13,8 @@ from utn_sumo.contract import AREA_REACH_M, ZONES_M, Bools, Floats, Network
 
 FREE_SHARE = 0.25
 """Share of its storage up to which the farthest zone in sight leaves those behind it moving freely."""
-SLOW = 1.5
-"""Over the time at free speed, that of the slowest."""
+FAST, SLOW = 0.8, 1.5
+"""Over the time at free speed, that of the fastest and of the slowest."""
 LATE_S = 5.0
 """And so much later they may come in sight, from a standing start."""
 NOTED_S = 2.0
@@ -33,10 +33,9 @@ class Hidden:
         """`aside` (Z,) has the links onto or off which some go amid it, counted."""
         length_m = np.array([link.length_m for link in network.links])
         speed_m_s = np.array([link.free_speed_m_s for link in network.links])
-        self._free_s = np.maximum(length_m - AREA_REACH_M, 0.0) / speed_m_s
-        """(Z,) from entry to where sight begins."""
-        self._slow_s = SLOW * self._free_s + LATE_S
-        """(Z,) the same of the slowest."""
+        free_s = np.maximum(length_m - AREA_REACH_M, 0.0) / speed_m_s
+        self._fast_s, self._slow_s = FAST * free_s, SLOW * free_s + LATE_S
+        """(Z,) from entry to where sight begins, of the fastest and of the slowest."""
         self._free_veh = FREE_SHARE * network.storage_veh * (ZONES_M[-1] - ZONES_M[-2]) / length_m
         """(Z,) vehicles in the farthest zone up to which it flows freely."""
         self._all_come = ~aside
@@ -84,11 +83,11 @@ class Hidden:
         return np.asarray(np.maximum(can_be, 0.0))
 
     def _recent(self, time_s: float, came_veh: Floats) -> tuple[Floats, Floats]:
-        """(Z,) who came within the time at free speed to where sight begins, (Z,) and within that of the slowest."""
+        """(Z,) who came within the time of the fastest to where sight begins, (Z,) and within that of the slowest."""
         oldest_first = np.roll(np.arange(len(self._noted_s)), -self._last - 1)
         noted_s, links = self._noted_s[oldest_first], np.arange(len(came_veh))
         # The first moment within the one time, and the last before the other.
-        first = oldest_first[np.minimum(np.searchsorted(noted_s, time_s - self._free_s), len(noted_s) - 1)]
+        first = oldest_first[np.minimum(np.searchsorted(noted_s, time_s - self._fast_s), len(noted_s) - 1)]
         last = oldest_first[np.maximum(np.searchsorted(noted_s, time_s - self._slow_s, side="right") - 1, 0)]
         least, most = (came_veh - self._noted_veh[moment, links] for moment in (first, last))
         return np.maximum(least, 0.0), np.maximum(most, 0.0)
