@@ -216,6 +216,7 @@ class Eyes:
         _counted(
             self._x_veh, left, self._x_veh, self._entered_veh, self._left_veh, self._parted_veh, self._set_link
         )  # fmt: skip
+        self._hidden.correct(0.0, *[np.zeros(self._links)] * 4)
 
 
 def _farthest(network: Network, ids: DetectorIds) -> list[list[str]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from utn_sumo.compiling import compiled
 from utn_sumo.contract import AREA_REACH_M, ZONES_M, Bools, Floats, Network
 
 FREE_SHARE = 0.25
@@ -67,27 +68,63 @@ class Hidden:
         `came_veh` (Z,) have come by now, as in `note`; `seen_veh` (Z,) are in sight, `far_veh` (Z,) of them in the
         farthest zone.
         """
-        least_veh, most_veh = self._recent(time_s, came_veh)
-        free = far_veh <= self._free_veh
-        low = seen_veh + np.where(free, np.minimum(self._all_come * least_veh, self._unseen_veh), -self._lanes)
-        high = seen_veh + np.where(free, np.minimum(most_veh, self._unseen_veh), self._unseen_veh + self._lanes)
-        came = came_veh - self._came_veh
-        self._came_veh = came_veh.copy()
-        gain = np.clip(self._gained / (self._of + KNOWN_VEH), -1.0, 1.0)
-        can_be = np.clip(x_veh + gain * came, low, high)
-        self._gain_since += can_be - x_veh
-        self._came_since += came
-        self._gained[free] = KEPT_SHARE * self._gained[free] + self._gain_since[free]
-        self._of[free] = KEPT_SHARE * self._of[free] + self._came_since[free]
-        self._gain_since[free], self._came_since[free] = 0.0, 0.0
-        return np.asarray(np.maximum(can_be, 0.0))
+        least_veh, most_veh = _recent(
+            time_s, came_veh, self._last, self._noted_s, self._noted_veh, self._fast_s, self._slow_s
+        )
+        veh: Floats = _corrected(
+            x_veh, came_veh, seen_veh, far_veh <= self._free_veh, least_veh, most_veh, self._all_come,
+            self._unseen_veh, self._lanes, self._came_veh, self._gained, self._of, self._gain_since, self._came_since,
+        )  # fmt: skip
+        return veh
 
-    def _recent(self, time_s: float, came_veh: Floats) -> tuple[Floats, Floats]:
-        """(Z,) who came within the time of the fastest to where sight begins, (Z,) and within that of the slowest."""
-        oldest_first = np.roll(np.arange(len(self._noted_s)), -self._last - 1)
-        noted_s, links = self._noted_s[oldest_first], np.arange(len(came_veh))
-        # The first moment within the one time, and the last before the other.
-        first = oldest_first[np.minimum(np.searchsorted(noted_s, time_s - self._fast_s), len(noted_s) - 1)]
-        last = oldest_first[np.maximum(np.searchsorted(noted_s, time_s - self._slow_s, side="right") - 1, 0)]
-        least, most = (came_veh - self._noted_veh[moment, links] for moment in (first, last))
-        return np.maximum(least, 0.0), np.maximum(most, 0.0)
+
+@compiled
+def _recent(
+    time_s: float, came_veh: Floats, last: int, noted_s: Floats, noted_veh: Floats, fast_s: Floats, slow_s: Floats
+) -> tuple[Floats, Floats]:
+    """(Z,) who came within the time of the fastest to where sight begins, (Z,) and within that of the slowest."""
+    least_veh, most_veh = came_veh.copy(), came_veh.copy()
+    moments = len(noted_s)
+    for link in range(len(came_veh)):
+        # From the last moment noted back to the first within the one time, and to the last before the other.
+        early = last
+        back = 1
+        while back < moments and noted_s[(last - back) % moments] >= time_s - fast_s[link]:
+            early = (last - back) % moments
+            back += 1
+        late = early
+        while back < moments and noted_s[late] > time_s - slow_s[link]:
+            late = (last - back) % moments
+            back += 1
+        least_veh[link] = max(came_veh[link] - noted_veh[early, link], 0.0)
+        most_veh[link] = max(came_veh[link] - noted_veh[late, link], 0.0)
+    return least_veh, most_veh
+
+
+@compiled
+def _corrected(
+    x_veh: Floats, came_veh: Floats, seen_veh: Floats, free: Bools, least_veh: Floats, most_veh: Floats,
+    all_come: Bools, unseen_veh: Floats, lanes: Floats,
+    came_before: Floats, gained: Floats, of: Floats, gain_since: Floats, came_since: Floats,
+) -> Floats:  # fmt: skip
+    """As Hidden.correct, (Z,) each, `free` where traffic flows; the last five are taken up to now."""
+    can_be = np.empty_like(x_veh)
+    for link in range(len(x_veh)):
+        came = came_veh[link] - came_before[link]
+        came_before[link] = came_veh[link]
+        veh = x_veh[link] + min(max(gained[link] / (of[link] + KNOWN_VEH), -1.0), 1.0) * came
+        hidden_veh = unseen_veh[link]
+        if free[link]:
+            low = min(least_veh[link], hidden_veh) if all_come[link] else 0.0
+            high = min(most_veh[link], hidden_veh)
+        else:
+            low, high = -lanes[link], hidden_veh + lanes[link]
+        veh = min(max(veh, seen_veh[link] + low), seen_veh[link] + high)
+        gain_since[link] += veh - x_veh[link]
+        came_since[link] += came
+        if free[link]:
+            gained[link] = KEPT_SHARE * gained[link] + gain_since[link]
+            of[link] = KEPT_SHARE * of[link] + came_since[link]
+            gain_since[link] = came_since[link] = 0.0
+        can_be[link] = max(veh, 0.0)
+    return can_be
