@@ -86,16 +86,14 @@ def _recent(
     least_veh, most_veh = came_veh.copy(), came_veh.copy()
     moments = len(noted_s)
     for link in range(len(came_veh)):
-        # From the last moment noted back to the first within the one time, and to the last before the other.
-        early = last
-        back = 1
-        while back < moments and noted_s[(last - back) % moments] >= time_s - fast_s[link]:
-            early = (last - back) % moments
-            back += 1
-        late = early
-        while back < moments and noted_s[late] > time_s - slow_s[link]:
+        # From the last moment back to the first within the one time, and to the last before the other.
+        early = late = last
+        for back in range(1, moments):
+            if noted_s[late] <= time_s - slow_s[link]:
+                break
             late = (last - back) % moments
-            back += 1
+            if noted_s[late] >= time_s - fast_s[link]:
+                early = late
         least_veh[link] = max(came_veh[link] - noted_veh[early, link], 0.0)
         most_veh[link] = max(came_veh[link] - noted_veh[late, link], 0.0)
     return least_veh, most_veh
