@@ -178,9 +178,11 @@ def test_nobody_counts_as_gone_with_his_green_where_he_goes_on_while_who_walks_i
         assert (gaps.amid_veh[gaps.waiting > 0] == (0.0 if goes_on else AMID_VEH)).all()
 
 
-@pytest.mark.parametrize(("cycle_lost_bins", "left_share"), [(8, 0.2), (7, 0.2), (7, 0.9)])
+@pytest.mark.parametrize(
+    ("cycle_lost_bins", "left_share", "full"), [(8, 0.2, False), (7, 0.2, False), (7, 0.9, False), (7, 0.9, True)]
+)
 def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
-    cycle_lost_bins: int, left_share: float, street_of: StreetOf
+    cycle_lost_bins: int, left_share: float, full: bool, street_of: StreetOf
 ) -> None:
     network = street_of(odd_nets.two_lanes)
     streams, stages = Streams(network), network.junctions[0].stages
@@ -192,20 +194,25 @@ def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
     waiting, seen = by_the_line(np.full(len(network.lane_sets), 5.0)), []
     stands = int(streams.lane_set[np.flatnonzero(giving.gaps.waiting[rows[stages[0]]] > 0)[0]])
     left, nobody = np.zeros(len(network.lane_sets)), np.zeros(len(streams.link), dtype=bool)
+    x_veh, left_ends = network.storage_veh * full, []
     for time_s in np.arange(0.0, 42.0, 2.0):
         stage, begin_s = (stages[0], 0.0) if time_s < 30 else (stages[1], 30.0)
         left += np.where(np.arange(len(left)) == stands, 0.0, 2.0)
         now = replace(scene(network, float(time_s), np.array([stage])), begin_s=np.array([begin_s]), left_veh=left)
-        giving.look(now, everywhere, rows[now.stage], waiting, nobody)
+        giving.look(replace(now, x_veh=x_veh), everywhere, rows[now.stage], waiting, nobody)
         shown = giving.gaps.flowing[rows[stage], : len(streams.link)]
         assert (shown[streams.lane_set != stands] == 1).all()
         seen.append(float(shown[streams.lane_set == stands][0]))
         # Who waits there has left it: nobody more goes as this green ends, where that counts.
         to_come, waits = giving.gaps.to_come[rows[stage]], giving.gaps.waiting[rows[stage]] > 0
         counts = waits & (cycle_lost_bins >= 4 * len(stages) or left_share > 0.75)
-        assert (to_come == np.where(counts, shown, 1)).all()
+        assert (to_come[~counts] == 1).all()
+        left_ends.append(to_come[counts].min(initial=1.0))
     assert seen[:3] == [1.0, 1.0, 1.0]
-    assert seen[14] < 0.1
+    # Most of a lane waits until the queue that comes has gone by, and that it stands says nothing of what it will do
+    # then: but on a full road it has no time for that.
+    assert seen[14] == 1 if left_share > 0.75 and not full else seen[14] < 0.1
+    assert left_ends[14] < 0.1 or not counts.any()
     assert seen[16:18] == [1.0, 1.0]
 
 

@@ -21,6 +21,10 @@ lane waits. Elsewhere it was found to do harm: a green that ends the sooner cost
 Where the road that he goes onto leads to another signal a few metres on, of the same junction or not, and that has red,
 nobody finds a gap: the first stands amid the junction until a stage lets him off it, and has left his lane (within.py).
 
+A lane most of whose traffic waits stands for as long as a queue comes towards it, and goes when that has gone by: a
+green that ended because it stood would end just then. So there it counts as no sign of what will go, as long as the
+lane's road and those that it leads onto have room: on full ones who has red is in more of a hurry.
+
 Where another stage of the junction has a lane set to itself, or people walk, yielding.py has learnt what it does.
 """
 
@@ -159,9 +163,8 @@ class Giving:
         self._shown = streams.first_stage[:-1].astype(np.int64)
         """(J,) row of the stage that each junction has shown."""
         self._shares = streams.shares(network.fraction)
-        lanes = np.array([link.lanes for link in network.links])
-        self._full_veh = np.where(network.storage_veh < SHORT_VEH * lanes, ROOM * network.storage_veh, np.inf)
-        """(Z,) vehicles on a short link with which it may be full."""
+        self._short = network.storage_veh < SHORT_VEH * np.array([link.lanes for link in network.links])
+        """(Z,) links that empty in one green."""
 
     def look(self, view: Shown, asked: Bools, present: Ints, zone: Floats, amid: Bools) -> None:
         """Take up how fast those go who have green before the junctions `asked` (J,); as Yielding.look.
@@ -175,10 +178,10 @@ class Giving:
                 if not others.isdisjoint(changed):
                     self._take_up(junction)
             _see(
-                view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0], view.x_veh >= self._full_veh,
-                amid, network.set_saturation_flow_veh_s, network.link_junction[network.set_link], self._long,
-                self._flowing, self._queued, self._looked_s, self._left_veh, streams.lane_set, streams.next_link,
-                streams.first, self.gaps,
+                view.time_s, asked, present, view.begin_s, view.left_veh, zone[:, 0],
+                view.x_veh >= ROOM * network.storage_veh, self._short, amid, network.set_saturation_flow_veh_s,
+                network.link_junction[network.set_link], self._long, self._flowing, self._queued, self._looked_s,
+                self._left_veh, streams.lane_set, streams.link, streams.next_link, streams.first, self.gaps,
             )  # fmt: skip
 
     def take_up(self, shares: Shares) -> None:
@@ -233,14 +236,16 @@ def _foes(network: Network, streams: Streams, row: int, stage: int, way: int) ->
 
 @compiled
 def _see(
-    time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, full: Bools, amid: Bools,
-    flow: Floats, set_junction: Ints, long: Bools, flowing: Floats, queued: Bools, looked_s: Floats, before: Floats,
-    stream_set: Ints, next_link: Ints, first: Ints, gaps: Gaps,
+    time_s: float, asked: Bools, present: Ints, begin_s: Floats, left: Floats, near: Floats, full: Bools,
+    short: Bools, amid: Bools, flow: Floats, set_junction: Ints, long: Bools, flowing: Floats, queued: Bools,
+    looked_s: Floats, before: Floats, stream_set: Ints, stream_link: Ints, next_link: Ints, first: Ints, gaps: Gaps,
 ) -> None:  # fmt: skip
-    behind = np.zeros(len(flowing), np.bool_)
+    behind, crowded = np.zeros((2, len(flowing)), np.bool_)
     for stream, ahead in enumerate(next_link):
+        crowded[stream_set[stream]] |= full[stream_link[stream]]
         if ahead != EXIT:
-            behind[stream_set[stream]] |= full[ahead]
+            crowded[stream_set[stream]] |= full[ahead]
+            behind[stream_set[stream]] |= full[ahead] and short[ahead]
     for lane_set, junction in enumerate(set_junction):
         if not asked[junction]:
             continue
@@ -258,11 +263,13 @@ def _see(
             row = present[junction]
             for stream in range(first[junction], first[junction + 1]):
                 own, share = stream - first[junction], flowing[stream_set[stream]]
+                most = gaps.waiting[row, own] >= MOST_SHARE
+                goes = most and gaps.beside[row, own] and not (gaps.shut[row, own] or crowded[stream_set[stream]])
                 stands = gaps.waiting[row, own] > 0 or behind[stream_set[stream]] or share < STANDING
                 # Who stands amid it has taken the room that there was: whoever comes next for it stops the lane.
                 share = min(share, 1 - amid[stream] * gaps.shut[row, own] * gaps.waiting[row, own])
-                gaps.flowing[row, own] = share if stands else 1.0
-                counts = gaps.waiting[row, own] > 0 and (long[junction] or gaps.waiting[row, own] >= MOST_SHARE)
+                gaps.flowing[row, own] = share if stands and not goes else 1.0
+                counts = gaps.waiting[row, own] > 0 and (long[junction] or most)
                 gaps.to_come[row, own] = share if counts and gaps.beside[row, own] else 1.0
 
 
