@@ -207,6 +207,8 @@ def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
         to_come, waits = giving.gaps.to_come[rows[stage]], giving.gaps.waiting[rows[stage]] > 0
         counts = waits & (cycle_lost_bins >= 4 * len(stages) or left_share > 0.75)
         assert (to_come[~counts] == 1).all()
+        if full or left_share < 0.75:
+            assert (to_come == np.where(counts, shown, 1)).all()
         left_ends.append(to_come[counts].min(initial=1.0))
     assert seen[:3] == [1.0, 1.0, 1.0]
     # Most of a lane waits until the queue that comes has gone by, and that it stands says nothing of what it will do
