@@ -103,6 +103,8 @@ def _schedule(
     `gaps` None says that nobody waits for any: the machine code for that is another, and quicker.
     """
     chosen = present
+    # For the compiler a number that is written out is a type of its own, with machine code of its own.
+    at_once, later = np.int64(0), np.int64(1)
     before, regret[0] = regret[0], 0.0
     called = _called(present, low, stages, rules, stand, come)
     if called.any():
@@ -113,7 +115,7 @@ def _schedule(
         # What was best a bin ago is seldom far from what is best now.
         known = _leads_to(plan, low, stages, rules, gaps, traffic, sent)
         for limit in (known + ALIKE * (2 + known), NEVER):
-            chosen = _search(present, rest, low, after, rules, gaps, traffic, limit, plan)
+            chosen = _search(present, rest, low, after, rules, gaps, traffic, limit, plan, at_once)
             if chosen >= 0:
                 break
         if chosen != present and rest > 0:
@@ -123,7 +125,8 @@ def _schedule(
             if may_cost > 0:
                 known = _leads_to(plan, low, stages, rules, gaps, traffic, sent)
                 staying = plan.copy()
-                if _search(present, rest, low, after, rules, gaps, traffic, known + may_cost, staying, 1) == present:
+                limit = known + may_cost
+                if _search(present, rest, low, after, rules, gaps, traffic, limit, staying, later) == present:
                     chosen, plan[:] = present, staying
                     waited = _leads_to(plan, low, stages, rules, gaps, traffic, sent)
                     regret[0] = before + max(waited - known, ALIKE)
@@ -154,7 +157,7 @@ def _called(present: int, low: int, stages: int, rules: Rules, stand: Floats, co
 @compiled
 def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for the compiler
     present: int, rest: int, low: int, after: Bools, rules: Rules, gaps: Gaps | None, traffic: Traffic, limit: float,
-    plan: Ints, soonest: int = 0,
+    plan: Ints, soonest: int,
 ) -> int:  # fmt: skip
     """The stage that is led to in the first bin, and into `plan` (K,) each row; -1 if all costs `limit` or more.
 
