@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from utn_sumo.cli import main
+
 
 @pytest.fixture(scope="session", autouse=True)
 def route_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
@@ -36,5 +38,21 @@ def utn(command: str, folder: Path) -> Callable[..., subprocess.CompletedProcess
         return subprocess.run(
             [command, *arguments], cwd=folder, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
         )
+
+    return run
+
+
+@pytest.fixture
+def refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """The command in this process, for what ends before anything is run: it spares a second of imports each."""
+    monkeypatch.chdir(folder)
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        with pytest.raises(SystemExit) as ended:
+            main(list(arguments))
+        printed, complaint = capfd.readouterr()
+        return subprocess.CompletedProcess(arguments, ended.value.code, printed, complaint)
 
     return run

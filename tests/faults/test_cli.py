@@ -129,11 +129,11 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
 
 @pytest.mark.parametrize(("arguments", "thing", "remedy"), MISTAKES.values(), ids=MISTAKES.keys())
 def test_a_mistake_is_one_line_with_its_remedy_and_leaves_nothing_behind(
-    utn: Utn, folder: Path, arguments: tuple[str, ...], thing: str, remedy: str
+    refused: Utn, folder: Path, arguments: tuple[str, ...], thing: str, remedy: str
 ) -> None:
     for name, content in FILES.items():
         (folder / name).write_text(content, encoding="utf-8")
-    done = utn(*arguments)
+    done = refused(*arguments)
     left_behind = {path.name for path in folder.iterdir()} - set(FILES) - {"__pycache__"}
     assert not left_behind
     assert thing in done.stderr
@@ -278,14 +278,14 @@ def trips(file: Path) -> list[dict[str, str]]:
     ids=lambda value: " ".join(value[:3]) if isinstance(value, tuple) else "",
 )
 def test_what_cannot_be_is_said_before_anything_is_run(
-    utn: Utn, folder: Path, arguments: tuple[str, ...], words: list[str]
+    refused: Utn, folder: Path, arguments: tuple[str, ...], words: list[str]
 ) -> None:
     (folder / "file").touch()
     for name, content in {"empty": "{}", "list": "[]", "typo": '{"scenario": {"hourz": 1}}'}.items():
         (folder / name).mkdir()
         (folder / name / "settings.json").write_text(content, encoding="utf-8")
     (folder / "routes.xml").write_text("<routes/>", encoding="utf-8")
-    line = one_line(utn(*arguments))
+    line = one_line(refused(*arguments))
     assert [word for word in words if word not in line] == []
     # Another try may have the same folder.
     assert not (folder / "new").exists() or not any((folder / "new").iterdir())

@@ -13,6 +13,8 @@ from utn_sumo import bridge, demand
 from utn_sumo.contract import Network
 from utn_sumo.scenario import scenario
 
+from .odd_nets import Make
+
 
 @pytest.fixture(scope="session", autouse=True)
 def route_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
@@ -34,6 +36,19 @@ def run_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[dict
         return made[key]
 
     return run
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Make], Path]:
+    """The .sumocfg of one of `odd_nets`; tests leave its folder as it is."""
+    files: dict[Make, Path] = {}
+
+    def write(make: Make) -> Path:
+        if make not in files:
+            files[make] = make(tmp_path_factory.mktemp(make.__name__))
+        return files[make]
+
+    return write
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from xml.etree import ElementTree as ET
 from utn_sumo.sumo_tools import sumo_binary
 
 Phases = Iterable[tuple[float, str]]
+Make = Callable[[Path], Path]
 
 NO_TURNAROUNDS = "--no-turnarounds"
 ARM_M = 200
@@ -954,7 +955,7 @@ def mesoscopic(folder: Path) -> Path:
     return case(folder, traffic("C"), options={"mesosim": "true", "meso-junction-control": "true"})
 
 
-CASES: tuple[Callable[[Path], Path], ...] = (
+CASES: tuple[Make, ...] = (
     plain,
     pedestrians,
     protected_crossings,

@@ -9,53 +9,47 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
-from tests.integration import odd_nets
 
 from utn_sumo import bridge, replay
 from utn_sumo.errors import SettingError
 from utn_sumo.scenario import scenario
 from utn_sumo.sumo_tools import sumo_binary
 
+from . import odd_nets
+from .odd_nets import Make
+
 RULES = ("max_wave", "max_pressure", "priced")
 
 
 @pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
-def test_it_runs_odd_nets_safely(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    result = bridge.run(scenario(net=str(make(tmp_path)), controller="priced", seed=5), tmp_path / "run")
+def test_it_runs_odd_nets_safely(make: Make, made: Callable[[Make], Path], tmp_path: Path) -> None:
+    result = bridge.run(scenario(net=str(made(make)), controller="priced", seed=5), tmp_path / "run")
     assert (result["unsafe_signal_s"], result["unsafe_reasons"]) == (0, [])
     assert (result["fallbacks"], result["fallback_reasons"]) == (0, [])
     assert result["arrived"] > 0
 
 
-@pytest.fixture(scope="module")
-def delay_veh_h(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., float]:
-    """Total delay of an hour of `utn17`."""
-    found: dict[tuple[str, float], float] = {}
-
-    def measure(controller: str, demand: float) -> float:
-        if (controller, demand) not in found:
-            chosen = scenario(controller=controller, demand=demand, hours=1, seed=11)
-            found[controller, demand] = bridge.run(chosen, tmp_path_factory.mktemp("run") / "out")["total_delay_veh_h"]
-        return found[controller, demand]
-
-    return measure
+@pytest.fixture
+def hour_of(run_of: Callable[..., tuple[dict[str, Any], Path]]) -> Callable[[str, float], dict[str, Any]]:
+    """Measures of an hour of `utn17` under a controller, at a demand."""
+    return lambda controller, demand: run_of(controller=controller, demand=demand, hours=1, seed=11)[0]
 
 
 @pytest.mark.parametrize("rule", RULES)
 def test_in_light_traffic_every_rule_halves_the_delay_of_fixed_times(
-    rule: str, delay_veh_h: Callable[..., float]
+    rule: str, hour_of: Callable[[str, float], dict[str, Any]]
 ) -> None:
-    assert delay_veh_h(rule, 0.5) < 0.6 * delay_veh_h("fixed", 0.5)
+    assert hour_of(rule, 0.5)["total_delay_veh_h"] < 0.6 * hour_of("fixed", 0.5)["total_delay_veh_h"]
 
 
-def test_prices_keep_a_crowded_network_moving(delay_veh_h: Callable[..., float]) -> None:
-    assert delay_veh_h("priced", 1.3) < 0.5 * min(delay_veh_h(each, 1.3) for each in ("max_wave", "fixed"))
+def test_prices_keep_a_crowded_network_moving(hour_of: Callable[[str, float], dict[str, Any]]) -> None:
+    priced, rule, fixed = (hour_of(each, 1.3)["total_delay_veh_h"] for each in ("priced", "max_wave", "fixed"))
+    assert priced < 0.5 * min(rule, fixed)
 
 
-def test_nobody_waits_for_ever(tmp_path: Path) -> None:
-    result = bridge.run(scenario(controller="max_wave", demand=1.3, hours=1, seed=3), tmp_path / "run")
+def test_nobody_waits_for_ever(hour_of: Callable[[str, float], dict[str, Any]]) -> None:
     # The rule alone would let somebody wait longer than the signal heads have patience for.
-    assert 150 < result["longest_red_s"] <= 180
+    assert 150 < hour_of("max_wave", 1.3)["longest_red_s"] <= 180
 
 
 @pytest.mark.parametrize("rule", ["priced"])

@@ -12,6 +12,7 @@ from utn_sumo import bridge
 from utn_sumo.scenario import scenario
 
 from . import odd_nets
+from .odd_nets import Make
 
 PEERS = ("tuc", "proportional", "cyclic_max_pressure")
 every_peer = pytest.mark.parametrize("controller", PEERS)
@@ -32,8 +33,8 @@ def test_it_is_safe_needs_nobody_to_step_in_and_delays_less_than_equal_splits(
 @pytest.mark.long
 @every_peer
 @pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
-def test_it_runs_odd_nets_safely(make: Callable[[Path], Path], controller: str, tmp_path: Path) -> None:
-    result = bridge.run(scenario(net=str(make(tmp_path)), controller=controller, seed=5), tmp_path / "run")
+def test_it_runs_odd_nets_safely(make: Make, controller: str, made: Callable[[Make], Path], tmp_path: Path) -> None:
+    result = bridge.run(scenario(net=str(made(make)), controller=controller, seed=5), tmp_path / "run")
     assert (result["unsafe_signal_s"], result["unsafe_reasons"]) == (0, [])
     assert (result["fallbacks"], result["fallback_reasons"]) == (0, [])
     assert result["arrived"] > 0

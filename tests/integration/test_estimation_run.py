@@ -75,22 +75,21 @@ def test_vehicles_are_estimated_within_two_over_half_an_hour(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
 class TestFourHours:
     def test_vehicles_are_estimated_within_two_over_all_links_and_cycles(
-        self, run_of: RunOf, seed: int, record_property: Callable[[str, object], None]
+        self, run_of: RunOf, record_property: Callable[[str, object], None]
     ) -> None:
-        error = error_of(run_of(hours=4, seed=seed)[1])
+        error = error_of(run_of(hours=4)[1])
         report(record_property, error)
         assert rmse(error) <= OVERALL_RMSE_VEH
 
-    def test_no_link_is_estimated_worse_than_within_three(self, run_of: RunOf, utn17: Network, seed: int) -> None:
-        by_link = rmse(error_of(run_of(hours=4, seed=seed)[1]), 0)
+    def test_no_link_is_estimated_worse_than_within_three(self, run_of: RunOf, utn17: Network) -> None:
+        by_link = rmse(error_of(run_of(hours=4)[1]), 0)
         worst = int(by_link.argmax())
         assert by_link[worst] <= LINK_RMSE_VEH, f"link {utn17.links[worst].id}"
 
-    def test_the_last_hour_is_estimated_no_worse_than_the_first(self, run_of: RunOf, seed: int) -> None:
-        error = error_of(run_of(hours=4, seed=seed)[1])
+    def test_the_last_hour_is_estimated_no_worse_than_the_first(self, run_of: RunOf) -> None:
+        error = error_of(run_of(hours=4)[1])
         assert rmse(error[-CYCLES_AN_HOUR:]) <= max(rmse(error[:CYCLES_AN_HOUR]), DRIFT_RMSE_VEH)
 
 
@@ -146,11 +145,10 @@ class TestMiscountingLoops:
         assert rmse(error[-CYCLES_AN_HOUR:]) <= max(rmse(error[:CYCLES_AN_HOUR]), OVERALL_RMSE_VEH)
 
     @pytest.mark.long
-    @pytest.mark.parametrize("seed", [1, 2])
     def test_a_crowded_network_is_estimated_better_than_by_plain_counting(
-        self, run_of: RunOf, seed: int, record_property: Callable[[str, object], None]
+        self, run_of: RunOf, record_property: Callable[[str, object], None]
     ) -> None:
-        folder = run_of(hours=2, demand=1.3, loop_error=LOOP_ERROR, seed=seed)[1]
+        folder = run_of(hours=2, demand=1.3, loop_error=LOOP_ERROR)[1]
         error = error_of(folder)
         report(record_property, error)
         assert rmse(error) <= rmse(error_of_plain_counting(folder)) / 2
@@ -196,11 +194,10 @@ def foreseeable_queue(folder: Path, net: Network) -> Floats:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
 class TestSourceQueues:
     @pytest.fixture
-    def folder(self, run_of: RunOf, seed: int) -> Path:
-        return run_of(hours=2, demand=1.3, seed=seed)[1]
+    def folder(self, run_of: RunOf) -> Path:
+        return run_of(hours=2, demand=1.3)[1]
 
     def test_queues_outside_a_crowded_network_are_estimated(
         self, folder: Path, utn17: Network, record_property: Callable[[str, object], None]

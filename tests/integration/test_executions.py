@@ -11,7 +11,6 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from tests.integration import odd_nets
 
 from utn_sumo import bridge, monitor, streets
 from utn_sumo.contract import EXIT, Network
@@ -21,6 +20,9 @@ from utn_sumo.errors import ControllerError, SettingError, UtnError
 from utn_sumo.plant.eyes import Eyes, Sight
 from utn_sumo.plant.heads import Heads
 from utn_sumo.scenario import scenario
+
+from . import odd_nets
+from .odd_nets import Make
 
 Run = Callable[..., tuple[dict[str, Any], Path]]
 
@@ -133,8 +135,8 @@ def test_any_planner_runs_with_any_execution(run_of: Run, controller: str, execu
 
 
 @pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
-def test_greens_that_end_early_are_safe_on_odd_nets(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    chosen = scenario(net=str(make(tmp_path)), controller="fixed", execution="actuated", seed=5)
+def test_greens_that_end_early_are_safe_on_odd_nets(make: Make, made: Callable[[Make], Path], tmp_path: Path) -> None:
+    chosen = scenario(net=str(made(make)), controller="fixed", execution="actuated", seed=5)
     result = bridge.run(chosen, tmp_path / "run")
     assert (result["unsafe_signal_s"], result["unsafe_reasons"]) == (0, [])
     assert (result["fallbacks"], result["fallback_reasons"]) == (0, [])
@@ -398,8 +400,10 @@ def test_zones_show_where_vehicles_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
-def test_zones_cover_what_the_detectors_see_and_nothing_twice(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    net = streets.named(str(make(tmp_path)))
+def test_zones_cover_what_the_detectors_see_and_nothing_twice(
+    make: Make, made: Callable[[Make], Path], tmp_path: Path
+) -> None:
+    net = streets.named(str(made(make)))
     write(net, tmp_path / "detectors.add.xml", 90, within_step=True)
     areas: dict[str, list[tuple[float, float]]] = {}
     zones: dict[str, list[tuple[float, float]]] = {}

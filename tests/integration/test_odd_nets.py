@@ -25,8 +25,8 @@ from utn_sumo.sumo_signals import PEERS
 from utn_sumo.sumo_tools import sumo_binary
 
 from . import odd_nets
+from .odd_nets import Make
 
-Make = Callable[[Path], Path]
 Shown = list[tuple[str, float]]
 """(letters, seconds), one after the other."""
 Run = Callable[[Make, str], tuple[dict[str, Any], Path]]
@@ -67,19 +67,6 @@ GREEN = frozenset("Gg")
 
 every_case = pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
 every_controller = pytest.mark.parametrize("controller", CONTROLLERS)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Make], Path]:
-    """The .sumocfg of a case; tests leave its folder as it is."""
-    files: dict[Make, Path] = {}
-
-    def write(make: Make) -> Path:
-        if make not in files:
-            files[make] = make(tmp_path_factory.mktemp(make.__name__))
-        return files[make]
-
-    return write
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ from utn_sumo.plant import inside
 from utn_sumo.scenario import scenario
 
 from . import odd_nets
+from .odd_nets import Make
 
 Run = Callable[..., tuple[dict[str, Any], Path]]
 
@@ -79,8 +80,8 @@ def test_cologne_is_delayed_less_than_by_the_best_that_is_published(seed: int, t
 
 @pytest.mark.long
 @pytest.mark.parametrize("make", odd_nets.CASES, ids=lambda make: make.__name__)
-def test_it_runs_odd_nets_safely(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    result = bridge.run(scenario(net=str(make(tmp_path)), controller="recommended", seed=5), tmp_path / "run")
+def test_it_runs_odd_nets_safely(make: Make, made: Callable[[Make], Path], tmp_path: Path) -> None:
+    result = bridge.run(scenario(net=str(made(make)), controller="recommended", seed=5), tmp_path / "run")
     assert_safe(result)
     assert result["arrived"] > 0
 

@@ -212,7 +212,7 @@ def test_the_reference_simulation_is_recovered(seed: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_reference_simulation_is_recovered_by_the_exact_likelihood(seed: int) -> None:
     found = reference_estimates(seed)
     assert all(abs(found[name] - value) <= 3 * deviation for name, (value, deviation) in REFERENCE.items())
