@@ -22,6 +22,7 @@ from utn_controllers.scheduled.ending import (
     ahead_bins,
     are_alone,
     are_apart,
+    are_far,
     beyond,
     greens,
     lost,
@@ -628,7 +629,7 @@ class TestEnding:
         assert found[2] - found[1] == pytest.approx((12 - 8) * (found[1] - found[0]) / (8 - 4), rel=0.5)
 
     def test_schedules_go_farther_where_the_clearances_of_a_junction_alone_take_long(
-        self, utn17: Network, street_of: Callable[[Make], Network]
+        self, street_of: Callable[[Make], Network]
     ) -> None:
         network = street_of(odd_nets.actuated_left_turns)
         alone = are_alone(network, Streams(network))
@@ -639,8 +640,24 @@ class TestEnding:
         assert near == 25 < some < more < most == endless
         # Who wants it farther than any has it so.
         assert ahead_bins(alone, 100, np.array([30])) == [100]
-        assert not are_alone(utn17, Streams(utn17)).any()
-        assert (ahead_bins(are_alone(utn17, Streams(utn17)), 25, np.full(8, 30)) == 25).all()
+        assert are_far(network, Streams(network)).all()
+        assert (ahead_bins(np.zeros(8, dtype=np.bool_), 25, np.full(8, 30)) == 25).all()
+
+    def test_schedules_go_farther_where_the_roads_ahead_take_what_is_let_go_and_those_beyond_them(
+        self, tmp_path: Path
+    ) -> None:
+        def of(network: Network) -> list[bool]:
+            found = are_far(network, Streams(network))
+            return [bool(found[[junction.id for junction in network.junctions].index(name)]) for name in "ABCD"]
+
+        net = streets.named(str(odd_nets.row("ABCD", gap_m=400, lanes=2).net(tmp_path, odd_nets.NO_TURNAROUNDS)))
+        assert of(net) == [True] * 4
+        # Between C and D there is room for a few: B's would stand before C.
+        short = tuple(replace(link, storage_veh=4) if link.id in ("C-D", "D-C") else link for link in net.links)
+        assert of(replace(net, links=short)) == [True, False, False, False]
+        # With a little more room they get on from there, but neither C nor D knows what happens in a minute.
+        longer = tuple(replace(link, storage_veh=15) if link.id in ("C-D", "D-C") else link for link in net.links)
+        assert of(replace(net, links=longer)) == [True, True, False, False]
 
     @pytest.mark.parametrize(
         ("names", "gap_m", "layout", "found"),

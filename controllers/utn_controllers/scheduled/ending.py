@@ -39,9 +39,12 @@ LEAST_LOAD, NONE_BINS = 1e-6, 1e-9
 """Who hardly comes needs some green too; green that is none."""
 
 FAR_BINS, FARTHER, FARTHEST_BINS = 9, 3.0, 60
-"""For each bin more than so many that clearances take of a cycle, a schedule of a junction apart goes so many farther,
-up to so many. One that ends before each stage has had its turn changes them more often than there is time for, and has
-those wait of whom fewest leave in a bin."""
+"""For each bin more than so many that clearances take of a cycle, a schedule goes so many farther where it may, up to so
+many. One that ends before each stage has had its turn changes them more often than there is time for, and has those
+wait of whom fewest leave in a bin."""
+FAR_FILLING_S, NEXT_FILLING_S = 60.0, 20.0
+"""It may where the roads ahead take all that leaves in such a time, and those beyond the next signals in such a one:
+what is let go in longer greens has to get on from there."""
 APART_STAGES = 4
 """A junction among others can be apart if it has so many stages: of three a schedule sees most."""
 FILLING_S = 84.0
@@ -223,21 +226,40 @@ def are_apart(network: Network, streams: Streams, alone: Bools) -> Bools:
     known there.
     """
     count, links = len(alone), np.bincount(network.link_junction, minlength=len(alone))
-    onward = streams.next_link != EXIT
-    ahead = streams.next_link[onward]
-    fills_s = network.storage_veh[ahead] / network.set_saturation_flow_veh_s[streams.lane_set[onward]]
     fed = np.zeros(len(network.links), dtype=np.bool_)
-    fed[ahead] = True
+    fed[streams.next_link[streams.next_link != EXIT]] = True
     from_others = np.bincount(network.link_junction, fed, count)
     apart = (np.diff(streams.first_stage) >= APART_STAGES) & (from_others <= (1 - OUTSIDE) * links)
-    apart[network.link_junction[streams.link[onward][fills_s < FILLING_S]]] = False
+    apart[filling_s(network, streams) < FILLING_S] = False
     apart[network.link_junction[network.begins_amid]] = False
     return np.asarray(apart | alone)
 
 
-def ahead_bins(apart: Bools, bins: int, lost_bins: Ints) -> Ints:
-    """(J,) bins that schedules have: so many, or more of junctions `apart` (J,) whose cycles lose `lost_bins` (J,)."""
-    more = FARTHER * np.maximum(lost_bins - FAR_BINS, 0) * apart
+def are_far(network: Network, streams: Streams) -> Bools:
+    """(J,) junctions whose schedules may go farther where clearances take long: there is room ahead, and beyond that."""
+    ahead_s, beyond_s = filling_s(network, streams), np.full(len(network.junctions), np.inf)
+    onward = streams.next_link != EXIT
+    here, there = (network.link_junction[links[onward]] for links in (streams.link, streams.next_link))
+    np.minimum.at(beyond_s, here, ahead_s[there])
+    return np.asarray((ahead_s >= FAR_FILLING_S) & (beyond_s >= NEXT_FILLING_S))
+
+
+def filling_s(network: Network, streams: Streams) -> Floats:
+    """(J,) time in which a queue before each junction would fill a road ahead, if nobody left that [s].
+
+    Of its lanes, at their saturation flow, and of the road that is full first; infinite where none leads to a signal.
+    """
+    onward = streams.next_link != EXIT
+    flow_veh_s = network.set_saturation_flow_veh_s[streams.lane_set[onward]]
+    found = np.full(len(network.junctions), np.inf)
+    here = network.link_junction[streams.link[onward]]
+    np.minimum.at(found, here, network.storage_veh[streams.next_link[onward]] / flow_veh_s)
+    return found
+
+
+def ahead_bins(far: Bools, bins: int, lost_bins: Ints) -> Ints:
+    """(J,) bins that schedules have: so many, or more of junctions that `are_far` (J,) whose cycles lose many."""
+    more = FARTHER * np.maximum(lost_bins - FAR_BINS, 0) * far
     return np.rint(np.minimum(bins + more, max(FARTHEST_BINS, bins))).astype(np.int64)
 
 
