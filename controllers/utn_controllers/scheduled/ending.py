@@ -39,8 +39,8 @@ LEAST_LOAD, NONE_BINS = 1e-6, 1e-9
 """Who hardly comes needs some green too; green that is none."""
 
 FAR_BINS, FARTHER, FARTHEST_BINS = 9, 3.0, 60
-"""For each bin more than so many that clearances take of a cycle, a schedule goes so many farther where it may, up to so
-many. One that ends before each stage has had its turn changes them more often than there is time for, and has those
+"""For each bin more than so many that clearances take of a cycle, a schedule goes so many farther, up to so many, where
+it may. One that ends before each stage has had its turn changes them more often than there is time for, and has those
 wait of whom fewest leave in a bin."""
 FAR_FILLING_S, NEXT_FILLING_S = 60.0, 20.0
 """It may where the roads ahead take all that leaves in such a time, and those beyond the next signals in such a one:
@@ -236,7 +236,7 @@ def are_apart(network: Network, streams: Streams, alone: Bools) -> Bools:
 
 
 def are_far(network: Network, streams: Streams) -> Bools:
-    """(J,) junctions whose schedules may go farther where clearances take long: there is room ahead, and beyond that."""
+    """(J,) junctions whose schedules may go farther where clearances take long: with room ahead, and beyond that."""
     ahead_s, beyond_s = filling_s(network, streams), np.full(len(network.junctions), np.inf)
     onward = streams.next_link != EXIT
     here, there = (network.link_junction[links[onward]] for links in (streams.link, streams.next_link))
