@@ -2,7 +2,9 @@
 
 To the stage that follows in the net's own programme it is the net's own clearance, to the second. To another one it is
 made: who loses green has the yellow that the net gives it, who gains green waits as long after each conflicting stream
-as the net has them wait, or the longest that the junction has where the net never shows the two in turn.
+as the net has them wait, or the longest that the junction has after one of its kind, who walks or who drives, where the
+net never shows the two in turn. Where those who walk need longer than all others, these keep their green meanwhile, as
+the net has cars drive on while people are cleared.
 """
 
 from __future__ import annotations
@@ -31,6 +33,8 @@ class Times:
     """(letters,) after each signal's green."""
     between_s: Floats
     """(letters, letters) from the end of one's green to the begin of another's."""
+    longest_s: Floats
+    """(letters,) the longest from the end of a green, of who walks or of others as each is, to the stage after it."""
 
     @classmethod
     def of(cls, network: Network, junction: Junction) -> Times:
@@ -56,7 +60,21 @@ class Times:
                 if gaps:
                     between_s[a, b] = min(gaps)
         usual = np.nanmax(yellow_s) if np.isfinite(yellow_s).any() else USUAL_YELLOW_S
-        return cls(np.where(np.isnan(yellow_s), usual, yellow_s), between_s)
+        return cls(np.where(np.isnan(yellow_s), usual, yellow_s), between_s, _longest(network, junction, letters))
+
+
+def _longest(network: Network, junction: Junction, letters: int) -> Floats:
+    """`Times.longest_s`."""
+    own_s = np.zeros(letters)
+    for index in junction.stages:
+        stage, then = network.stages[index], network.stages[following(junction, index)]
+        states = [stage.state, *(state for state, seconds in stage.clearance for _ in range(round(seconds)))]
+        for a in range(letters):
+            if stage.state[a] in GREEN and then.state[a] not in GREEN:
+                last = max(second for second, state in enumerate(states) if state[a] in GREEN)
+                own_s[a] = max(own_s[a], len(states) - 1 - last)
+    walks = np.isin(np.arange(letters), junction.crossings)
+    return np.asarray(np.where(walks, own_s[walks].max(initial=0.0), own_s[~walks].max(initial=0.0)))
 
 
 def following(junction: Junction, stage: int) -> int:
@@ -72,22 +90,26 @@ def between(network: Network, junction: Junction, times: Times, first: int, then
     was, becomes = network.stages[first].state, network.stages[then].state
     closing = [a for a, letter in enumerate(was) if letter in GREEN and becomes[a] not in GREEN]
     opening = [b for b, letter in enumerate(becomes) if letter in GREEN and was[b] not in GREEN]
-    longest_s = max((network.stages[stage].clearance_s for stage in junction.stages), default=0.0)
-    needed_s = [0.0]
+    needed_s = {True: 0, False: 0}
     for a in closing:
-        needed_s += [times.yellow_s[a] * (a not in junction.without_yellow)]
-        for b in opening:
-            if junction.conflicts[a][b]:
-                # Known gaps are of streams that follow each other; longer ones have other stages in between.
-                needed_s.append(min(longest_s, np.nan_to_num(times.between_s[a, b], nan=longest_s)))
-    seconds = math.ceil(max(needed_s))
+        # Known gaps are of streams that follow each other; longer ones have other stages in between.
+        gaps_s = np.fmin(times.between_s[a], times.longest_s[a])[[b for b in opening if junction.conflicts[a][b]]]
+        walks = a in junction.crossings
+        needed_s[walks] = math.ceil(max(needed_s[walks], _yellow_s(junction, times, a), gaps_s.max(initial=0.0)))
+    seconds = max(needed_s.values())
+    drive_on_s = seconds - needed_s[False]
 
     def letter(signal: int, second: int) -> str:
         if signal in closing:
-            return "y" if second < times.yellow_s[signal] and signal not in junction.without_yellow else "r"
+            since_s = second - drive_on_s * (signal not in junction.crossings)
+            return was[signal] if since_s < 0 else "y" if since_s < _yellow_s(junction, times, signal) else "r"
         if was[signal] in GREEN:
             return "G" if was[signal] == becomes[signal] == "G" else "g"
         return "r" if becomes[signal] in GREEN else becomes[signal]
 
     states = ["".join(letter(signal, second) for signal in range(len(was))) for second in range(seconds)]
     return tuple((state, float(len(list(group)))) for state, group in groupby(states))
+
+
+def _yellow_s(junction: Junction, times: Times, letter: int) -> float:
+    return float(times.yellow_s[letter] * (letter not in junction.without_yellow))

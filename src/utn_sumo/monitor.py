@@ -148,15 +148,30 @@ class _Rules:
 
     @classmethod
     def in_any_order(cls, network: Network, junction: Junction) -> _Rules:
-        """The same for stages in any order: what the programme has beyond one stage, or one clearance, need not be."""
+        """The same for stages in any order: what the programme has beyond one stage, or one clearance, need not be.
+
+        Not longer after a driver's green than it has the next stage wait after one, nor after a walker's.
+        """
         own = cls.of(network, junction, executed=True)
         stages = [network.stages[index] for index in junction.stages]
-        longest_s = max(stage.clearance_s for stage in stages)
         green = [
             min([least_s, *(stage.least_green_s for stage in stages if stage.state[signal] in GREEN)])
             for signal, least_s in enumerate(own.green_s)
         ]
-        return cls(green, own.yellow_s, [[min(least_s, longest_s) for least_s in row] for row in own.between_s])
+        longest_s = {True: 0.0, False: 0.0}
+        for stage, then in zip(stages, [*stages[1:], stages[0]], strict=True):
+            for signal, (was, becomes) in enumerate(zip(stage.state, then.state, strict=True)):
+                if was in GREEN and becomes not in GREEN:
+                    rest = 0.0
+                    for state, seconds in stage.clearance:
+                        rest = 0.0 if state[signal] in GREEN else rest + seconds
+                    walks = signal in junction.crossings
+                    longest_s[walks] = max(longest_s[walks], rest)
+        between = [
+            [min(least_s, longest_s[signal in junction.crossings]) for least_s in row]
+            for signal, row in enumerate(own.between_s)
+        ]
+        return cls(green, own.yellow_s, between)
 
 
 class _Guard:

@@ -178,7 +178,7 @@ def _departs_s(element: ET.Element) -> float:
     return 0 if said == "triggered" else float(said)
 
 
-def _pockets() -> Streets:
+def pockets() -> Streets:
     """A crossroads whose arms have a second lane, for left turns, on the last 50 m before it."""
     streets = row("C").without("W-C", "E-C", "nC-C", "sC-C")
     for start, x, y in (("W", -50, 0), ("E", 50, 0), ("nC", 0, 50), ("sC", 0, -50)):
@@ -368,7 +368,7 @@ def short_arrow(folder: Path, *, end_s: int = 300) -> Path:
         *((25, "rrrGGrrrrGGr"), (3, "rrryyrrrryyr"), (2, DARK), (4, "rrrrrGrrrrrG"), (3, "rrrrryrrrrry"), (2, DARK)),
         *((25, NORTH_SOUTH), (3, "yyyrrryyyrrr"), (2, DARK)),
     )
-    retime(_pockets().net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
+    retime(pockets().net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
     ways = (("W", "E", 10), ("E", "W", 10), ("W", "nC", 30))
     flows = "".join(flow(f"{a}_{b}", f"{a}-p{a}", f"C-{b}", period=period, end=end_s) for a, b, period in ways)
     return case(folder, flows, end=str(end_s))
@@ -532,7 +532,7 @@ def actuated_by_delay(folder: Path) -> Path:
 def actuated_left_turns(folder: Path) -> Path:
     """The same with arrows for left turns, which may be as short as 5 s."""
     options = ("--tls.default-type", "actuated", "--tls.min-dur", "5", "--tls.left-green.time", "6")
-    _pockets().net(folder, NO_TURNAROUNDS, *options)
+    pockets().net(folder, NO_TURNAROUNDS, *options)
     return case(folder, _through_pockets())
 
 
@@ -558,7 +558,7 @@ def short_greens(folder: Path) -> Path:
         *((10, NORTH_SOUTH), (3, "yygrrryygrrr"), (5, "rrGrrrrrGrrr"), (3, "rryrrrrryrrr")),
         *((10, EAST_WEST), (3, "rrryygrrryyg"), (5, "rrrrrGrrrrrG"), (3, "rrrrryrrrrry")),
     )
-    retime(_pockets().net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
+    retime(pockets().net(folder, NO_TURNAROUNDS), tl_logic("C", shown))
     return case(folder, _through_pockets())
 
 
@@ -716,7 +716,7 @@ def blinking_at_night(folder: Path) -> Path:
 
 def turning_pockets(folder: Path) -> Path:
     """Lanes and arrows for left turns, which have green before the arrow and stay green until it comes."""
-    _pockets().net(folder, NO_TURNAROUNDS)
+    pockets().net(folder, NO_TURNAROUNDS)
     return case(folder, _through_pockets())
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from utn_sumo import clearances, monitor
+from tests.integration import odd_nets
+from utn_sumo import clearances, monitor, streets
 from utn_sumo.clearances import Times, between
 from utn_sumo.contract import Junction, Network
 from utn_sumo.plant.heads import Heads
@@ -61,14 +63,76 @@ def shown_by(network: Network, seed: int, duration_s: int) -> list[tuple[int, st
     return seen
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_monitor_has_nothing_to_say_against_any_order_of_stages(utn17: Network, tmp_path, seed: int) -> None:
-    changes = shown_by(utn17, seed, 1200)
+def recorded(network: Network, folder: Path, seed: int) -> Path:
+    """SUMO's record of that, of many changes."""
+    changes = shown_by(network, seed, 1200)
+    assert len(changes) > 10 * len(network.junctions)
     lines = [
         f'<tlsState time="{second}.00" id="{name}" programID="x" phase="0" state="{state}"/>'
         for second, name, state in changes
     ]
-    (tmp_path / "signals.xml").write_text(f"<tlsStates>{''.join(lines)}</tlsStates>", encoding="utf-8")
-    verdict = monitor.watch(utn17, tmp_path / "signals.xml", 1200, in_order=False)
+    (folder / "signals.xml").write_text(f"<tlsStates>{''.join(lines)}</tlsStates>", encoding="utf-8")
+    return folder / "signals.xml"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_monitor_has_nothing_to_say_against_any_order_of_stages(utn17: Network, tmp_path: Path, seed: int) -> None:
+    verdict = monitor.watch(utn17, recorded(utn17, tmp_path, seed), 1200, in_order=False)
     assert verdict.reasons == []
-    assert len(changes) > 100
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory: pytest.TempPathFactory) -> Network:
+    """Crossroads with a stage for left turns after each road's own, and people who walk beside it."""
+    options = (odd_nets.NO_TURNAROUNDS, "--sidewalks.guess", "--crossings.guess")
+    net = streets.named(str(odd_nets.pockets().net(tmp_path_factory.mktemp("walked"), *options)))
+    assert [len(junction.stages) for junction in net.junctions] == [4]
+    return net
+
+
+def test_cars_drive_on_while_who_walks_is_cleared_also_to_a_stage_that_does_not_follow(walked: Network) -> None:
+    junction = walked.junctions[0]
+    first, _, third, _ = junction.stages
+    own = walked.stages[first].clearance
+    (driving, cleared_s), (_, yellow_s) = own
+    made = ways(walked, junction)[first, third]
+    # As the net itself does it, but for left turns, which the stage that follows would let go on.
+    assert made[0] == (driving, cleared_s)
+    assert sum(seconds for _, seconds in made) == cleared_s + yellow_s
+    assert all(letter in "yr" for letter in made[1][0])
+    for walker in junction.crossings:
+        assert driving[walker] == "r"
+
+
+def test_who_walks_and_who_drives_is_cleared_as_long_as_the_net_has_it_at_most(walked: Network) -> None:
+    junction = walked.junctions[0]
+    longest_s = Times.of(walked, junction).longest_s
+    walks = np.isin(np.arange(len(longest_s)), junction.crossings)
+    cleared_s, yellow_s = (seconds for _, seconds in walked.stages[junction.stages[0]].clearance)
+    assert set(longest_s[walks]) == {cleared_s + yellow_s}
+    assert set(longest_s[~walks]) == {yellow_s}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_monitor_has_nothing_to_say_where_people_walk(walked: Network, tmp_path: Path, seed: int) -> None:
+    verdict = monitor.watch(walked, recorded(walked, tmp_path, seed), 1200, in_order=False)
+    assert verdict.reasons == []
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+def test_the_monitor_sees_a_second_too_few_for_who_walks_or_who_drives(
+    walked: Network, tmp_path: Path, phase: int
+) -> None:
+    junction = walked.junctions[0]
+    first, _, third, _ = junction.stages
+    made = ways(walked, junction)[first, third]
+    for missing in (0, 1):
+        shown, now_s = [], 0.0
+        for number, (state, seconds) in enumerate(
+            [(walked.stages[first].state, 20.0), *made, (walked.stages[third].state, 20.0)]
+        ):
+            shown.append(f'<tlsState time="{now_s:.2f}" id="{junction.id}" programID="x" phase="0" state="{state}"/>')
+            now_s += seconds - missing * (number == phase + 1)
+        (tmp_path / "signals.xml").write_text(f"<tlsStates>{''.join(shown)}</tlsStates>", encoding="utf-8")
+        verdict = monitor.watch(walked, tmp_path / "signals.xml", round(now_s), in_order=False)
+        assert (len(verdict.reasons) > 0) == (missing > 0)
