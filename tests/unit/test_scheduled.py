@@ -624,9 +624,16 @@ class TestEnding:
         quick = [[1, 2, 1], [2, 1, 1]]
         slow = [[1, 4, 1], [4, 1, 1]]
         three = [[1, 4, 9], [9, 1, 4], [4, 9, 1]]
-        found = staying(lost(first, np.array([*quick, *slow, *three])))
+        clearance, drives = np.array([*quick, *slow, *three]), np.ones(7, dtype=np.bool_)
+        found = staying(lost(first, clearance, drives))
         assert found[0] < found[1] < found[2]
         assert found[2] - found[1] == pytest.approx((12 - 8) * (found[1] - found[0]) / (8 - 4), rel=0.5)
+
+    def test_a_stage_for_people_alone_is_in_no_cycle_but_beside_one_for_cars(self) -> None:
+        clearance = np.array([[1, 4, 9], [9, 1, 5], [6, 3, 1]])
+        of = [True, True, False], [True, False, False], [True, True, True]
+        found = [lost(np.array([0, 3]), clearance, np.array(drives))[0] for drives in of]
+        assert found == [4 + 9, 4 + 5 + 6, 4 + 5 + 6]
 
     def test_schedules_go_farther_where_the_clearances_of_a_junction_alone_take_long(
         self, street_of: Callable[[Make], Network]
@@ -713,7 +720,7 @@ class TestEnding:
         needed = []
         for times in (0, 1, 2):
             none, nobody = np.zeros(len(come)), np.zeros((len(come), 25))
-            lost_bins = lost(streams.first_stage, times * clearance)
+            lost_bins = lost(streams.first_stage, times * clearance, streams.serves.any(axis=1))
             ending = Ending(streams, lost_bins, np.full(8, 25), np.ones(8, dtype=bool))
             everywhere = np.ones(8, dtype=bool)
             beyond_bins = ending.beyond_bins(everywhere, none, nobody)

@@ -19,6 +19,8 @@ costs it one clearance in any case, and whichever road is a little fuller would 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from utn_controllers.scheduled.streams import Streams
@@ -196,13 +198,18 @@ def greens(serves: Bools, needed: Floats) -> float:
     return total
 
 
-def lost(first_stage: Ints, clearance: Ints) -> Ints:
-    """(J,) bins that the clearances of a cycle take, by `Rules` of the junctions."""
-    sizes = np.diff(first_stage)
-    found = [
-        sum(clearance[first + place, (place + 1) % size] for place in range(size))
-        for first, size in zip(first_stage[:-1], sizes, strict=True)
-    ]
+def lost(first_stage: Ints, clearance: Ints, drives: Bools) -> Ints:
+    """(J,) bins that the clearances of a cycle take, by `Rules` of the junctions.
+
+    Of the stages in which motor traffic `drives` (S,), where there are several: one for people alone is shown when
+    somebody calls for it.
+    """
+    found = []
+    for first, last in pairwise(first_stage):
+        driven = [place for place in range(last - first) if drives[first + place]]
+        shown = driven if len(driven) > 1 else range(last - first)
+        after = [*shown[1:], *shown[:1]]
+        found.append(sum(clearance[first + place, then] for place, then in zip(shown, after, strict=True)))
     return np.array(found, dtype=np.int64)
 
 

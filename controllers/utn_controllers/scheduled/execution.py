@@ -71,7 +71,7 @@ class Scheduled:
         self._calling = Calling(network, self._streams, self._sides)
         alone = are_alone(network, self._streams)
         moves = Moves(network, self._calling, BIN_S, alone)
-        lost_bins = lost(self._streams.first_stage, moves.bins)
+        lost_bins = lost(self._streams.first_stage, moves.bins, np.asarray(self._streams.serves.any(axis=1)))
         apart = are_apart(network, self._streams, alone)
         ahead = ahead_bins(are_far(network, self._streams), round(self.settings.horizon_s / BIN_S), lost_bins)
         bins = int(ahead.max())
