@@ -636,7 +636,7 @@ class TestEnding:
         assert found == [4 + 9, 4 + 5 + 6, 4 + 5 + 6]
 
     def test_schedules_go_farther_where_the_clearances_of_a_junction_alone_take_long(
-        self, street_of: Callable[[Make], Network]
+        self, utn17: Network, street_of: Callable[[Make], Network]
     ) -> None:
         network = street_of(odd_nets.actuated_left_turns)
         alone = are_alone(network, Streams(network))
@@ -648,7 +648,8 @@ class TestEnding:
         # Who wants it farther than any has it so.
         assert ahead_bins(alone, 100, np.array([30])) == [100]
         assert are_far(network, Streams(network)).all()
-        assert (ahead_bins(np.zeros(8, dtype=np.bool_), 25, np.full(8, 30)) == 25).all()
+        assert not are_alone(utn17, Streams(utn17)).any()
+        assert (ahead_bins(are_alone(utn17, Streams(utn17)), 25, np.full(8, 30)) == 25).all()
 
     def test_schedules_go_farther_where_the_roads_ahead_take_what_is_let_go_and_those_beyond_them(
         self, tmp_path: Path
