@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,9 @@ from utn_controllers.scheduled.ending import (
     are_far,
     beyond,
     greens,
+    have_way,
     lost,
+    lost_at_least,
     needing,
     prices,
     staying,
@@ -634,6 +637,59 @@ class TestEnding:
         of = [True, True, False], [True, False, False], [True, True, True]
         found = [lost(np.array([0, 3]), clearance, np.array(drives))[0] for drives in of]
         assert found == [4 + 9, 4 + 5 + 6, 4 + 5 + 6]
+
+    def test_of_a_cycle_that_could_be_shorter_only_the_stages_that_all_need_count(self) -> None:
+        # Two roads with their left turns apart, and a stage for each arm besides: by four of the eight all have way.
+        of_arm = [[0, 4], [1, 5], [2, 6], [3, 7]]
+        of_road = [[0, 1], [2, 3], [4, 5], [6, 7]]
+        way = np.zeros((8, 8), dtype=np.bool_)
+        for stage, streams in enumerate([*of_road, *of_arm]):
+            way[stage, streams] = True
+        clearance = np.full((8, 8), 3)
+        first = np.array([0, 8])
+        assert lost(first, clearance, way.any(axis=1)) == [24]
+        assert lost_at_least(first, clearance, way) == [12]
+        # Of several such cycles it is the quickest: by arms, then by one road and the arms of the other.
+        clearance[:4, :4] = 5
+        assert lost_at_least(first, clearance, way) == [12]
+        clearance[4:, 4:] = 6
+        assert lost_at_least(first, clearance, way) == [5 + 3 + 6 + 3]
+        # Without the other one's stages there is no choice, and nobody has to have a way who has none anywhere.
+        assert lost_at_least(np.array([0, 4]), clearance[:4, :4], way[:4]) == [20]
+        assert lost_at_least(np.array([0, 4]), clearance[:4, :4], way[:4, :6]) == [5 + 5 + 5]
+
+    @given(
+        way=st.lists(st.lists(st.booleans(), min_size=4, max_size=4), min_size=2, max_size=6),
+        seed=st.integers(0, 99),
+    )
+    def test_it_is_the_quickest_of_those_with_fewest_stages(self, way: list[list[bool]], seed: int) -> None:
+        has_way, first = np.array(way), np.array([0, len(way)])
+        clearance = np.random.default_rng(seed).integers(1, 10, (len(way), len(way)))
+        found = lost_at_least(first, clearance, has_way)[0]
+        every, stages = has_way.any(axis=0), range(len(way))
+        cycles = [
+            cycle
+            for count in range(2, len(way) + 1)
+            for cycle in combinations(stages, count)
+            if (has_way[list(cycle)].any(axis=0) == every).all()
+        ]
+        fewest = min(map(len, cycles))
+        assert found == min(
+            sum(clearance[a, b] for a, b in zip(cycle, (*cycle[1:], cycle[0]), strict=True))
+            for cycle in cycles
+            if len(cycle) == fewest
+        )
+
+    def test_a_turn_that_gives_way_in_one_stage_needs_the_one_in_which_it_has_way(
+        self, street_of: Callable[[Make], Network]
+    ) -> None:
+        network = street_of(odd_nets.actuated_left_turns)
+        streams = Streams(network)
+        way = have_way(network, streams)
+        assert (way <= streams.serves).all()
+        assert (way.any(axis=0) == streams.serves.any(axis=0)).all()
+        # Some have green in a stage in which they give way, and way in another one.
+        assert (streams.serves & ~way).any()
 
     def test_schedules_go_farther_where_the_clearances_of_a_junction_alone_take_long(
         self, utn17: Network, street_of: Callable[[Make], Network]

@@ -19,11 +19,13 @@ costs it one clearance in any case, and whichever road is a little fuller would 
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Iterable, Sequence
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from utn_controllers.scheduled.streams import Streams
+from utn_sumo.clearances import HAS_WAY
 from utn_sumo.compiling import compiled, inlined
 from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
@@ -208,9 +210,43 @@ def lost(first_stage: Ints, clearance: Ints, drives: Bools) -> Ints:
     for first, last in pairwise(first_stage):
         driven = [place for place in range(last - first) if drives[first + place]]
         shown = driven if len(driven) > 1 else range(last - first)
-        after = [*shown[1:], *shown[:1]]
-        found.append(sum(clearance[first + place, then] for place, then in zip(shown, after, strict=True)))
+        found.append(sum(clearance[first + place, then] for place, then in _turns(shown)))
     return np.array(found, dtype=np.int64)
+
+
+def lost_at_least(first_stage: Ints, clearance: Ints, has_way: Bools) -> Ints:
+    """(J,) bins that clearances take of the shortest cycle in which all streams have way at their stages (S, N).
+
+    It has as few stages as can be, two or more. Where traffic may go round a junction in several ways, as with a stage
+    for each arm besides those of opposite ones, schedules need not reach them all.
+    """
+    found = []
+    for first, last in pairwise(first_stage):
+        own = has_way[first:last, has_way[first:last].any(axis=0)]
+        needed = own[:, own.sum(axis=0) == 1].any(axis=1)
+        others: list[int] = np.flatnonzero(~needed).tolist()
+        cycles: list[list[int]] = []
+        for count in range(max(2 - int(needed.sum()), 0), len(others) + 1):
+            each = (sorted([*np.flatnonzero(needed).tolist(), *more]) for more in combinations(others, count))
+            cycles = [cycle for cycle in each if own[cycle].any(axis=0).all()]
+            if cycles:
+                break
+        found.append(min((sum(clearance[first + a, b] for a, b in _turns(cycle)) for cycle in cycles), default=0))
+    return np.array(found, dtype=np.int64)
+
+
+def _turns(cycle: Sequence[int]) -> Iterable[tuple[int, int]]:
+    return zip(cycle, [*cycle[1:], *cycle[:1]], strict=True)
+
+
+def have_way(network: Network, streams: Streams) -> Bools:
+    """(S, N) whether a stage gives a stream way, or green where no stage gives it way."""
+    way = np.zeros_like(streams.serves)
+    for row, stage in enumerate(streams.stage):
+        state = network.stages[stage].state
+        for stream in np.flatnonzero(streams.serves[row]):
+            way[row, stream] = any(state[letter] == HAS_WAY for letter in streams.letters[stream])
+    return np.where(way.any(axis=0), way, streams.serves)
 
 
 def are_alone(network: Network, streams: Streams) -> Bools:

@@ -9,7 +9,16 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from utn_controllers.scheduled.calling import Calling
-from utn_controllers.scheduled.ending import Ending, ahead_bins, are_alone, are_apart, are_far, lost
+from utn_controllers.scheduled.ending import (
+    Ending,
+    ahead_bins,
+    are_alone,
+    are_apart,
+    are_far,
+    have_way,
+    lost,
+    lost_at_least,
+)
 from utn_controllers.scheduled.gaps import Giving
 from utn_controllers.scheduled.moves import Moves, Rules
 from utn_controllers.scheduled.outlook import Outlook
@@ -73,7 +82,11 @@ class Scheduled:
         moves = Moves(network, self._calling, BIN_S, alone)
         lost_bins = lost(self._streams.first_stage, moves.bins, np.asarray(self._streams.serves.any(axis=1)))
         apart = are_apart(network, self._streams, alone)
-        ahead = ahead_bins(are_far(network, self._streams), round(self.settings.horizon_s / BIN_S), lost_bins)
+        ahead = ahead_bins(
+            are_far(network, self._streams),
+            round(self.settings.horizon_s / BIN_S),
+            lost_at_least(self._streams.first_stage, moves.bins, have_way(network, self._streams)),
+        )
         bins = int(ahead.max())
         self._outlook = Outlook(network, self._streams, bins, BIN_S)
         self._worth = Worth(
