@@ -164,7 +164,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     `after` (s, s) has which stage may come after each; the present one ends in the bin `soonest` or later.
     """
     come, grown, paid, worth, most = traffic.come, traffic.grown, traffic.paid, traffic.worth, traffic.most
-    ends, due = traffic.ends, traffic.due
+    ends, due, red = traffic.ends, traffic.due, traffic.red
     moves, going, clearing, clearance = rules.moves, rules.going, rules.clearing, rules.clearance
     came, least = traffic.came, rules.least
     (streams, bins), stages = come.shape, len(after)
@@ -177,6 +177,9 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     queue[0, present] = traffic.stand
     best, last_begin, last_stage = limit, 0 if limit >= NEVER else -1, present
     others, veh = np.empty(stages, np.int64), np.empty(streams)
+    # Of the streams that move in a stage what their queues would weigh in red, and of those that move in a clearance
+    # how many more stood at its end if they had red.
+    waits, stays_on, fewer = np.empty((3, streams))
     pace, free, want, to_come, amid = np.ones((5, streams))
     stood, left = np.empty((2, stages + 1))
     for begin in range(bins):
@@ -191,7 +194,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
             while going[row, greens] >= 0:
                 moving += worth[going[row, greens]] * veh[going[row, greens]]
                 greens += 1
-            _stood(row, begin, low, veh, moves, came, worth, ends, stood, left)
+            _stood(stage, begin, veh, red, came, worth, ends, stood, left)
             held = stood[stages] + grown[stage, begin]
             nexts, lose = 0, bins
             for other in range(stages):
@@ -214,6 +217,10 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                         clear(row, veh, most, going, gaps, pace, to_come, amid)
                         for place in range(greens):
                             stays -= worth[going[row, place]] * amid[going[row, place]]
+                    for nth in range(greens):
+                        stream = going[row, nth]
+                        before = veh[stream] - came[stream, now]
+                        waits[nth], stays_on[nth] = worth[stream] * before, ends[stream] * before
                     for place in range(nexts):
                         other = others[place]
                         opens = min(now + clearance[row, other], bins)
@@ -223,13 +230,13 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                         if opens == bins:
                             until += left[stages] + due[stages, bins]
                             for nth in range(greens):
-                                stream = going[row, nth]
-                                until += ends[stream] * (veh[stream] - came[stream, now])
+                                until += stays_on[nth]
                         if clearing[row, other] >= 0:
                             if clearing[row, other] != won_in:
                                 won_in = clearing[row, other]
                                 won = _won(
-                                    won_in, begin, row, now, opens, veh, moves, going, come, came, worth, ends, most
+                                    won_in, begin, stage, now, opens, veh, moves, going, come, came, worth, ends, most,
+                                    red, fewer,
                                 )  # fmt: skip
                             until -= won
                         if until >= min(rank[opens, other], best) - ALIKE:
@@ -239,18 +246,18 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                             # As `stood` and `left`, with those who had green and will not have it then.
                             still, then = stood[other], left[other]
                             for nth in range(greens):
-                                stream = going[row, nth]
-                                if moves[low + other, stream] == 0:
-                                    before = veh[stream] - came[stream, now]
-                                    still += worth[stream] * before
-                                    then += ends[stream] * before
+                                has_red = red[going[row, nth], other]
+                                still += has_red * waits[nth]
+                                then += has_red * stays_on[nth]
                             rest_bins = bins - opens
                             behind = rest_bins * (grown[other, opens] + still) + due[other, opens] + then
                             if clearing[row, other] >= 0:
-                                behind -= _gone(
-                                    clearing[row, other], begin, row, now, opens, low + other, veh, moves, going,
-                                    come, came, worth, ends, most,
-                                )  # fmt: skip
+                                nth = 0
+                                while going[won_in, nth] >= 0:
+                                    stream = going[won_in, nth]
+                                    each = rest_bins * worth[stream] + ends[stream]
+                                    behind -= red[stream, other] * each * fewer[nth]
+                                    nth += 1
                         if until + behind < rank[opens, other] - ALIKE:
                             cost[opens, other], rank[opens, other] = until, until + behind
                             whence[opens, other, 0] = begin
@@ -306,18 +313,21 @@ def _sums(
     stages, (streams, bins) = len(serves), come.shape
     came = np.zeros((streams, bins + 1))
     grown, paid, due = np.zeros((3, stages + 1, bins + 1))
+    red = np.ones((streams, stages + 1))
     for stream in range(streams):
         for place in range(bins):
             came[stream, place + 1] = came[stream, place] + come[stream, place]
         for stage in range(stages + 1):
-            if stage == stages or serves[stage, stream] == 0:
+            if stage < stages and serves[stage, stream] > 0:
+                red[stream, stage] = 0.0
+            else:
                 for place in range(1, bins + 1):
                     grown[stage, place] += worth[stream] * came[stream, place]
                     due[stage, place] += ends[stream] * came[stream, place]
     for stage in range(stages + 1):
         for place in range(bins):
             paid[stage, place + 1] = paid[stage, place] + grown[stage, place + 1]
-    return Traffic(stand, come, came, grown, paid, due, worth, ends, kept, most)
+    return Traffic(stand, come, came, red, grown, paid, due, worth, ends, kept, most)
 
 
 @inlined
@@ -328,66 +338,45 @@ def _held(stage: int, grown: Floats, paid: Floats, since: int, until: int, weigh
 
 @inlined
 def _stood(
-    row: int, begin: int, low: int, veh: Floats, moves: Floats, came: Floats, worth: Floats, ends: Floats,
-    stood: Floats, left: Floats,
+    stage: int, begin: int, veh: Floats, red: Floats, came: Floats, worth: Floats, ends: Floats, stood: Floats,
+    left: Floats,
 ) -> None:  # fmt: skip
-    """What those weigh, in a bin and if `left`, who have red in the stage of a `row` and in each (s + 1), last in none.
+    """What those weigh, in a bin and if `left`, who have red in a stage and in each (s + 1), last in none.
 
     By the vehicles `veh` (n,) as it begins, less those who have come by then: with the sums of `Traffic` up to a bin
     it is what they weigh in that.
     """
-    stages = len(stood) - 1
     stood[:], left[:] = 0.0, 0.0
     for stream in range(len(veh)):
-        if moves[row, stream] == 0:
+        if red[stream, stage] > 0:
             before = veh[stream] - came[stream, begin]
-            for stage in range(stages + 1):
-                if stage == stages or moves[low + stage, stream] == 0:
-                    stood[stage] += worth[stream] * before
-                    left[stage] += ends[stream] * before
-
-
-@inlined
-def _gone(
-    clearing: int, begin: int, row: int, end: int, opens: int, other: int, veh: Floats, moves: Floats, going: Ints,
-    come: Floats, came: Floats, worth: Floats, ends: Floats, most: Floats,
-) -> float:  # fmt: skip
-    """What those would cost until the end who go in a clearance, and whom the stage after it does not serve."""
-    total, rest_bins, place = 0.0, come.shape[1] - opens, 0
-    while going[clearing, place] >= 0:
-        stream = going[clearing, place]
-        if moves[other, stream] == 0:
-            queue = veh[stream]
-            if moves[row, stream] == 0:
-                queue += came[stream, end] - came[stream, begin]
-            red = queue + came[stream, opens] - came[stream, end]
-            for now in range(end, opens):
-                queue = max(queue + come[stream, now] - moves[clearing + now - end, stream] * most[stream], 0.0)
-            total += (rest_bins * worth[stream] + ends[stream]) * (red - queue)
-        place += 1
-    return total
+            for other in range(len(stood)):
+                stood[other] += red[stream, other] * (worth[stream] * before)
+                left[other] += red[stream, other] * (ends[stream] * before)
 
 
 @inlined
 def _won(
-    clearing: int, begin: int, row: int, end: int, until: int, veh: Floats, moves: Floats, going: Ints, come: Floats,
-    came: Floats, worth: Floats, ends: Floats, most: Floats,
+    clearing: int, begin: int, stage: int, end: int, until: int, veh: Floats, moves: Floats, going: Ints, come: Floats,
+    came: Floats, worth: Floats, ends: Floats, most: Floats, red: Floats, fewer: Floats,
 ) -> float:  # fmt: skip
-    """What is waited less in a clearance than if all had red; `veh` of who had red already as the stage began."""
+    """What is waited less in a clearance than if all had red; `veh` of who had red already as the stage began.
+
+    And into `fewer`, of those that move in it one after the other, how many less stand at its end.
+    """
     won, place = 0.0, 0
     while going[clearing, place] >= 0:
         stream = going[clearing, place]
-        queue = veh[stream]
-        if moves[row, stream] == 0:
-            queue += came[stream, end] - came[stream, begin]
-        red, less = queue, 0.0
+        queue = veh[stream] + red[stream, stage] * (came[stream, end] - came[stream, begin])
+        stands, less = queue, 0.0
         for now in range(end, until):
-            red += come[stream, now]
+            stands += come[stream, now]
             queue = max(queue + come[stream, now] - moves[clearing + now - end, stream] * most[stream], 0.0)
-            less += red - queue
+            less += stands - queue
+        fewer[place] = stands - queue
         won += worth[stream] * less
         if until == come.shape[1]:
-            won += ends[stream] * (red - queue)
+            won += ends[stream] * fewer[place]
         place += 1
     return won
 

@@ -16,6 +16,8 @@ class Traffic(NamedTuple):
     """(n, K) vehicles."""
     came: Floats
     """(n, K + 1) sum of these."""
+    red: Floats
+    """(n, s + 1) 1 where a stream has red in a stage, else 0; 1 in the last column."""
     grown: Floats
     """(s + 1, K + 1) sum of what those weigh who have come and have red in a stage; in the last row, of all."""
     paid: Floats
