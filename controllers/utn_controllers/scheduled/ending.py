@@ -223,11 +223,12 @@ def lost_at_least(first_stage: Ints, clearance: Ints, has_way: Bools) -> Ints:
     found = []
     for first, last in pairwise(first_stage):
         own = has_way[first:last, has_way[first:last].any(axis=0)]
-        needed = own[:, own.sum(axis=0) == 1].any(axis=1)
-        others: list[int] = np.flatnonzero(~needed).tolist()
+        alone = own[:, own.sum(axis=0) == 1].any(axis=1)
+        always: list[int] = np.flatnonzero(alone).tolist()
+        others: list[int] = np.flatnonzero(~alone).tolist()
         cycles: list[list[int]] = []
-        for count in range(max(2 - int(needed.sum()), 0), len(others) + 1):
-            each = (sorted([*np.flatnonzero(needed).tolist(), *more]) for more in combinations(others, count))
+        for count in range(max(2 - len(always), 0), len(others) + 1):
+            each = (sorted([*always, *more]) for more in combinations(others, count))
             cycles = [cycle for cycle in each if own[cycle].any(axis=0).all()]
             if cycles:
                 break
