@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import logging
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,9 +12,11 @@ from types import FunctionType
 from typing import Any
 
 from numba import njit
-from numba.core import caching, config
+from numba.core import caching, config, event
 from numba.core.dispatcher import Dispatcher
 
+UNSAID_S = 5.0
+"""Whoever waits longer than this for machine code is told what for."""
 EXACT_ENOUGH = {"contract", "reassoc", "nsz", "arcp"}
 """What the compiler may do to sums and products; infinities keep their meaning."""
 
@@ -45,6 +49,34 @@ def _ours() -> Iterator[None]:
         yield
     finally:
         settings.CACHE_LOCATOR_CLASSES = before
+
+
+class _Announcement(event.Listener):
+    """Says once a process why nothing is to be seen for a while, as a warning of this module's logger."""
+
+    def __init__(self) -> None:
+        self._under_way = 0
+        """Functions that are being compiled: one, and those that it calls."""
+        self._since_s = self._spent_s = 0.0
+        self._said = False
+
+    def on_start(self, event: event.Event) -> None:  # noqa: ARG002 - which function is of no interest
+        """Something is not on disk yet."""
+        if not self._under_way:
+            self._since_s = time.perf_counter()
+        self._under_way += 1
+        if not self._said and self._spent_s + time.perf_counter() - self._since_s > UNSAID_S:
+            self._said = True
+            logging.getLogger(__name__).warning("compiling, the first time on this machine: up to a minute or so")
+
+    def on_end(self, event: event.Event) -> None:  # noqa: ARG002
+        """It is, or there was an error in it."""
+        self._under_way -= 1
+        if not self._under_way:
+            self._spent_s += time.perf_counter() - self._since_s
+
+
+event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
 
 
 class _Whole:

@@ -101,6 +101,8 @@ def table(result: dict[str, Any]) -> None:
         console.print(_window(brought), highlight=False)
     for reason in [*result.get("unsafe_reasons", []), *result.get("fallback_reasons", [])]:
         console.print(f"  ! {reason}")
+    if not result["arrived"] + result["unfinished"]:
+        console.print("  ! nobody departed: no vehicle of the routes departs in this window, give another one")
     if result["left_out_veh"]:
         number = result["left_out_veh"]
         console.print(f"  ! SUMO left out {number} vehicles: sort their routes by departure")

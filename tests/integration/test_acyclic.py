@@ -42,11 +42,13 @@ def test_in_light_traffic_every_rule_halves_the_delay_of_fixed_times(
     assert hour_of(rule, 0.5)["total_delay_veh_h"] < 0.6 * hour_of("fixed", 0.5)["total_delay_veh_h"]
 
 
+@pytest.mark.long
 def test_prices_keep_a_crowded_network_moving(hour_of: Callable[[str, float], dict[str, Any]]) -> None:
     priced, rule, fixed = (hour_of(each, 1.3)["total_delay_veh_h"] for each in ("priced", "max_wave", "fixed"))
     assert priced < 0.5 * min(rule, fixed)
 
 
+@pytest.mark.long
 def test_nobody_waits_for_ever(hour_of: Callable[[str, float], dict[str, Any]]) -> None:
     # The rule alone would let somebody wait longer than the signal heads have patience for.
     assert 150 < hour_of("max_wave", 1.3)["longest_red_s"] <= 180

@@ -72,7 +72,7 @@ def test_the_import_gives_the_trips_of_the_original_vehicle_for_vehicle(
 ) -> None:
     imported(scattered, tmp_path / "own")
     files = {path.name for path in (tmp_path / "own").iterdir()}
-    same_trips(scattered, tmp_path / "own" / "scenario.sumocfg", tmp_path, controller)
+    same_trips(scattered, tmp_path / "own" / "scenario.sumocfg", tmp_path, controller, hours=0.1)
     # Runs leave it as it was: what its detectors count is not written.
     assert {path.name for path in (tmp_path / "own").iterdir()} == files
 
@@ -87,7 +87,7 @@ def test_it_needs_nothing_that_lies_outside_of_it(scattered: Path, tmp_path: Pat
     assert sorted(result["files"].values()) == [
         *("detectors-2.add.xml", "routes-2.rou.xml", "routes.rou.xml", "town.net.xml.gz", "types.xml"),
     ]
-    bridge.run(scenario(net=str(elsewhere / "scenario.sumocfg"), controller="dmpc"), tmp_path / "run")
+    bridge.run(scenario(net=str(elsewhere / "scenario.sumocfg"), controller="dmpc", hours=0.1), tmp_path / "run")
     # SUMO alone runs it as well, with our detectors if they are asked for.
     for more in ([], ["--additional-files", str(elsewhere / "detectors.add.xml")]):
         command = [sumo_binary("sumo"), "-c", str(elsewhere / "scenario.sumocfg"), "--no-step-log", *more]
@@ -122,7 +122,7 @@ def test_what_lies_beside_the_net_comes_with_it(town: Path, utn17: Network, tmp_
     for name in ("utn17.turns.xml", "utn17.calibration.json"):
         assert (tmp_path / "own" / name).read_bytes() == utn17.net_file.with_name(name).read_bytes()
     assert result["calibration"].endswith("utn17.calibration.json")
-    same_trips(town, tmp_path / "own" / "scenario.sumocfg", tmp_path, "dmpc")
+    same_trips(town, tmp_path / "own" / "scenario.sumocfg", tmp_path, "dmpc", hours=0.1)
 
 
 def test_a_state_and_weights_that_options_name_are_copied_too(town: Path, tmp_path: Path) -> None:
@@ -177,7 +177,7 @@ def test_other_people_s_scenarios_run_as_they_did(name: str, tmp_path: Path) -> 
     shutil.copytree(file.parent, tmp_path / "theirs")
     file = tmp_path / "theirs" / file.name
     imported(file, tmp_path / "own")
-    same_trips(file, tmp_path / "own" / "scenario.sumocfg", tmp_path, "fixed", hours=0.2)
+    same_trips(file, tmp_path / "own" / "scenario.sumocfg", tmp_path, "fixed", hours=0.1)
 
 
 @pytest.mark.long

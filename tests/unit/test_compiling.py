@@ -84,3 +84,13 @@ def test_the_order_of_a_named_tuple_s_fields_counts(run):
 
 def test_what_is_not_in_the_machine_code_does_not_count(run):
     assert run(limits="LIMIT = 3\nOTHER = 5") == (14, 1)
+
+
+def test_who_waits_for_machine_code_is_told_what_for_and_nobody_else(run, tmp_path: Path):
+    impatient = "from utn_sumo import compiling\ncompiling.UNSAID_S = 0\n"
+    user = tmp_path / "user.py"
+    user.write_text(impatient + user.read_text(encoding="utf-8"), encoding="utf-8")
+    command = [sys.executable, "user.py"]
+    first, again = (subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True) for _ in range(2))
+    assert first.stderr == "compiling, the first time on this machine: up to a minute or so\n"
+    assert again.stderr == ""
