@@ -1,4 +1,4 @@
-"""The project's own benchmarks: every figure that the README quotes is printed by one of these.
+"""The project's own benchmarks: figures that the README quotes and no command of `utn` prints.
 
     python tools/bench.py overhead     control and bridge against the bare `sumo` binary on the same signals
     python tools/bench.py solve        centralized and distributed MPC: gaps, times, scale, failures
@@ -10,7 +10,7 @@
     python tools/bench.py bound        delay on a net that no controller can go below
     python tools/bench.py scale        a net of 1,000 signals: time to read it, and to step its model
 
-Each prints a table, or with --json one object (traffic, step, estimate and foresight: a list of objects).
+Each prints a table, or with --json one object (traffic, step, estimate, foresight and bound: a list of objects).
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ def cli() -> None:
 @click.option("--net", help="Shipped network, or a .net.xml file.  [utn17]")
 @click.option("--controller", help="Registered controller, path.py:Class, or native: the net's own.  [dmpc]")
 @click.option("--execution", help="How plans are carried out: exact, registered, path.py:Class.  [the controller's]")
-@click.option("--hours", help="Simulated hours.  [4]")
-@click.option("--demand", help="Scale of the demand profile.  [1.0]")
+@click.option("--hours", help="Simulated hours.  [4; of CASE its window]")
+@click.option("--demand", help="Scale of the demand profile, or of the traffic of CASE.  [1.0]")
 @click.option("--profile", help="Demand profile: peak, paper or constant.  [peak]")
 @click.option("--noise", help="Relative standard deviation of correlated demand noise.  [0]")
 @click.option("--disturbance", help="Vehicles an hour that come onto each link amid it, uncounted.  [0]")
@@ -261,7 +261,10 @@ def tune(
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
 def inspect(net: str, out: Path | None, as_json: bool) -> None:
-    """Show what the bench makes of NET: links, stages, storage, what is controlled and what is left alone."""
+    """Show what the bench makes of NET: links, stages, storage, what is controlled and what is left alone.
+
+    NET is a shipped net, a .net.xml, or a .sumocfg, of which it takes the net and its programmes.
+    """
     from utn_sumo import inspection, network, plots, recording, report, streets  # noqa: PLC0415 - heavy
 
     found = streets.named(net)

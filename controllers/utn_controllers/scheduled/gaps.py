@@ -91,7 +91,7 @@ class Gaps(NamedTuple):
     """(S, most streams of a junction) share of its lanes whose first to wait is still to come in the stage that is
     shown: of all in the others."""
     per_veh: float
-    """By what power of e fewer go for each vehicle in a bin that comes towards them."""
+    """Bins that a gap takes: by that power of e fewer go for each vehicle in a bin that comes towards them."""
 
 
 class Giving:

@@ -32,7 +32,7 @@ have to reach the stages behind it."""
 class Rules(NamedTuple):
     """What junctions (J) may show, by stages (S), and what moves then, by rows (R) of which the first are the stages'.
 
-    Junctions' stages and streams (N) are those of Streams.
+    Junctions' stages are those of Streams, their streams (A) those of Calling.
     """
 
     stages: Ints

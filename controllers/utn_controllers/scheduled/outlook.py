@@ -79,8 +79,8 @@ class Outlook:
         """(N,) vehicles by the stop line, (N, K) those that could be in each bin. A bin has gone by since.
 
         By the vehicles in `zones` (View.zone_veh) before junctions that are free: before others, who decide nothing
-        now, there are none. Those who are parked, `parked_veh` (Z,), are not among them. And (G,) by how much more
-        those weigh who hold others up.
+        now, there are none. Those who are parked, `parked_veh` (Z,), are not among them. And (G,) how many times as
+        much those weigh who hold others up.
         """
         self._now = (self._now + 1) % len(self._came)
         streams, network = self.streams, self.network

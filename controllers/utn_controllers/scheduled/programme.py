@@ -40,13 +40,13 @@ def schedules(
 
     And (J,) the same of the next bin, as far as it is foreseen: not where it would have changed, and stays.
 
-    `rest` (J,) bins that the present one may still go on. `stand` (N,), `come` (N, K) vehicles; `worth` (N,)
-    weight of a vehicle in a bin, `ends` (N,) of one that is left at the end, `kept` (N,) of one that has green then
-    and waits for no gaps, `most` (N,) that leave in a bin of green.
+    `rest` (J,) bins that the present one may still go on. `stand` (A,), `come` (A, K) vehicles; `worth` (A,)
+    weight of a vehicle in a bin, `ends` (A,) of one that is left at the end, `kept` (A,) of one that has green then
+    and waits for no gaps, `most` (A,) that leave in a bin of green.
 
     Of K bins schedules have as many as the rules say; beyond these `plan` has -1 and `sent` nobody.
 
-    `plan` (J, K) has the schedules of the bin before, `sent` (N, K) what each stream sends off by them: both are given
+    `plan` (J, K) has the schedules of the bin before, `sent` (A, K) what each stream sends off by them: both are given
     those of now. Of a schedule is said which row of the rules' moves each bin has, -1 for red; of junctions that are
     not free, what is left of the last one.
 

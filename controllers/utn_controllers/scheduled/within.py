@@ -17,7 +17,7 @@ from utn_controllers.scheduled.streams import Streams
 from utn_sumo.contract import Bools, Floats, Ints, Network
 
 IN_THE_WAY = 5.0
-"""By so much more all weigh on a road with a queue: between 3 and 8 it is no matter."""
+"""So many times as much all weigh on a road with a queue: between 3 and 8 it is no matter."""
 
 
 class Amid(Protocol):

@@ -85,7 +85,7 @@ class Worth:
 
         By the vehicles in `zones` (View.zone_veh) before the junctions `asked` (J,) and on all links `x` (Z,); the
         `shares` that streams and lane sets have of traffic; the `most` (N,) that can leave of each stream, whether it
-        is `stuck` (N,) before its green, and how much more lane groups (G,) weigh who hold others up.
+        is `stuck` (N,) before its green, and how many times as much lane groups (G,) weigh who hold others up.
         """
         network, streams = self._network, self._streams
         _lasting(

@@ -19,7 +19,6 @@ class Look:
     """How full the roads are at a moment."""
 
     time_s: float
-    on_road_veh: int
     halting_veh: int
     time_spent_veh_h: float
     """Since the run began, on the road or waiting to enter it, from the looks."""
@@ -77,7 +76,7 @@ def run(
             vehicles_veh = max(vehicles_veh, *map(libsumo.edge.getLastStepVehicleNumber, roads))
             on_road = libsumo.vehicle.getIDCount()
             present_veh_s += LOOK_S * (on_road + len(libsumo.simulation.getPendingVehicles()))
-            on_look(Look(now_s, on_road, sum(halting), present_veh_s / 3600))
+            on_look(Look(now_s, sum(halting), present_veh_s / 3600))
     except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
         raise broken_off(libsumo, error, log) from error
     except KeyboardInterrupt:
