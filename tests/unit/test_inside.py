@@ -48,6 +48,11 @@ def _turns_with(network: Network, stage: int, letters: str) -> list[int]:
     return [turn for letter, turns in shown for turn in turns if letter in letters]
 
 
+def _lead(inside: Inside, first: int, then: int) -> None:
+    """The first junction goes to another stage, which would begin at 23 s after all have had red."""
+    inside.leads(0, first, then, "r" * len(inside._network.stages[then].state), 23.0)
+
+
 class Crossing:
     """A junction with two roads whose left turns give way in one stage and are alone in the next."""
 
@@ -76,7 +81,7 @@ def crossing(street_of: StreetOf) -> Crossing:
 
 def test_the_red_lasts_as_long_as_two_are_inside_and_others_would_come_in(crossing: Crossing) -> None:
     traffic = crossing.full()
-    crossing.inside.leads(0, crossing.through, crossing.across, 23.0)
+    _lead(crossing.inside, crossing.through, crossing.across)
     assert crossing.inside.holds(0, 23.0)
     # Who stands there for good does not end it never.
     assert crossing.inside.holds(0, 23.0 + MOST_HOLD_S - 1)
@@ -89,13 +94,13 @@ def test_nobody_is_held_where_no_turns_of_the_next_road_are_close(crossing: Cros
     traffic = crossing.full()
     traffic.coming_veh.clear()
     traffic.coming_veh[crossing.network.turns[crossing.turning[0]].group] = 1.0
-    crossing.inside.leads(0, crossing.through, crossing.across, 23.0)
+    _lead(crossing.inside, crossing.through, crossing.across)
     assert not crossing.inside.holds(0, 23.0)
 
 
 def test_nobody_is_held_for_one_vehicle_wherever_it_waits(crossing: Crossing) -> None:
     traffic = crossing.full()
-    crossing.inside.leads(0, crossing.through, crossing.across, 23.0)
+    _lead(crossing.inside, crossing.through, crossing.across)
     for turns_veh in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
         for turn, veh in zip(crossing.turning, turns_veh, strict=True):
             traffic.inside_veh[turn] = veh
@@ -107,7 +112,7 @@ def test_before_two_lanes_abreast_it_lasts_for_one_vehicle_too(crossing: Crossin
     wide = tuple(replace(each, lanes=(*each.lanes, 9)) if each.group == group else each for each in network.lane_sets)
     inside = Inside(replace(network, lane_sets=wide), crossing.full())
     crossing.traffic.inside_veh[crossing.turning[0]] = 1.0
-    inside.leads(0, crossing.through, crossing.across, 23.0)
+    _lead(inside, crossing.through, crossing.across)
     assert inside.holds(0, 23.0)
 
 
@@ -115,19 +120,19 @@ def test_the_red_lasts_before_the_next_road_s_own_stage_for_turns_too(crossing: 
     stages = crossing.network.junctions[0].stages
     own = stages[(stages.index(crossing.across) + 1) % len(stages)]
     crossing.full()
-    crossing.inside.leads(0, crossing.through, own, 23.0)
+    _lead(crossing.inside, crossing.through, own)
     assert crossing.inside.holds(0, 23.0)
 
 
 def test_to_the_turns_own_stage_it_is_the_nets_clearance(crossing: Crossing) -> None:
     crossing.full()
-    crossing.inside.leads(0, crossing.through, crossing.alone, 23.0)
+    _lead(crossing.inside, crossing.through, crossing.alone)
     assert not crossing.inside.holds(0, 23.0)
 
 
 def test_nobody_is_held_for_those_who_go_or_wait_in_the_next_stage_too(crossing: Crossing) -> None:
     crossing.full()
-    crossing.inside.leads(0, crossing.across, crossing.through, 23.0)
+    _lead(crossing.inside, crossing.across, crossing.through)
     assert not crossing.inside.holds(0, 23.0)
 
 
@@ -181,7 +186,7 @@ class Walked:
         """Somebody is still amid the junction when the next road's green is to begin, others are close on these."""
         self.traffic.inside_veh = defaultdict(float, {turn: 1.0})
         self.traffic.coming_veh = defaultdict(float, dict.fromkeys(groups, 1.0))
-        self.inside.leads(0, self.first, self.then, 23.0)
+        _lead(self.inside, self.first, self.then)
         return self.inside.holds(0, 23.0)
 
 
@@ -235,26 +240,26 @@ def test_who_stands_behind_a_turn_that_shares_its_lane_holds_those_who_would_com
         traffic.inside_veh = defaultdict(float, {turn: 1.0})
         for groups in ({network.turns[other].group for other in _turns_with(network, then, "gG")}, set[int]()):
             traffic.coming_veh = defaultdict(float, dict.fromkeys(groups, 1.0))
-            inside.leads(0, first, then, 23.0)
+            _lead(inside, first, then)
             assert inside.holds(0, 23.0) == (is_held and len(groups) > 0)
             assert not inside.holds(0, 23.0 + MOST_HOLD_S)
     # Who drives is not waited for, nor who has green in the next stage too.
     everybody = defaultdict(float, dict.fromkeys(range(len(network.groups)), 1.0))
     traffic.standing_veh, traffic.inside_veh, traffic.coming_veh = defaultdict(float), {ahead: 1.0}, everybody
-    inside.leads(0, first, then, 23.0)
+    _lead(inside, first, then)
     assert not inside.holds(0, 23.0)
     traffic.standing_veh = defaultdict(float, {ahead: 1.0})
-    inside.leads(0, then, first, 23.0)
+    _lead(inside, then, first)
     assert not inside.holds(0, 23.0)
     # But who has stood since the green ended is let out, though he has set off.
-    inside.leads(0, first, then, 23.0)
+    _lead(inside, first, then)
     traffic.standing_veh = defaultdict(float)
     assert inside.holds(0, 23.0)
     traffic.inside_veh = defaultdict(float)
     assert not inside.holds(0, 24.0)
     # That was another green.
     traffic.inside_veh = defaultdict(float, {ahead: 1.0})
-    inside.leads(0, first, then, 23.0)
+    _lead(inside, first, then)
     assert not inside.holds(0, 23.0)
 
 
@@ -266,5 +271,5 @@ def test_where_no_turn_gives_way_nobody_is_ever_waited_for(utn17: Network) -> No
     for index, junction in enumerate(utn17.junctions):
         for first in junction.stages:
             for then in junction.stages:
-                inside.leads(index, first, then, 10.0)
+                inside.leads(index, first, then, utn17.stages[first].state, 10.0)
                 assert not inside.holds(index, 10.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -147,3 +148,34 @@ def test_several_who_stand_there_get_out_before_anybody_comes_in(
 
 def _green(network: Network, stage: int, link: str) -> bool:
     return any(network.links[network.turns[each].link].id == link for each in network.stages[stage].turns)
+
+
+def _one_by_one(folder: Path) -> Path:
+    """Carriageways apart of which one has red first: the other one keeps its green until the whole street has its."""
+    case = odd_nets.carriageways(folder)
+    phases = [(20, "rrrrGGGGrrGGGGrr"), (3, "rrrryyyyrrGGGGrr"), (10, "GgGGrrrrrrGGGGrr")]
+    phases += [(3, "GgGGrrrrrryyyyrr"), (20, "GgGGrrrrGGrrrrGg"), (3, "yyyyrrrryyrrrryy")]
+    odd_nets.retime(next(folder.glob("*.net.xml")), odd_nets.tl_logic("J", tuple(phases)))
+    return case
+
+
+def test_nobody_loses_his_green_without_yellow_while_others_get_out(street_of: StreetOf) -> None:
+    network = street_of(_one_by_one)
+    traffic, shown, later_s = Traffic(), [], []
+    traffic.standing_veh.update(dict.fromkeys(range(len(network.turns)), 1.0))
+    heads = Heads(network, lambda _, letters: shown.append(letters), traffic)
+    heads.start(0.0)
+    stages = network.junctions[0].stages
+    assert len(stages) == 3
+    for number, stage in enumerate([*stages[1:], *stages, *stages[::-1], stages[0]], start=1):
+        if stage != heads.stage[0]:
+            heads.switch(0, stage, 100.0 * number)
+            opens_s = heads.begin_s[0]
+            for second in range(99):
+                heads.advance(100.0 * number + second)
+            later_s.append(heads.begin_s[0] - opens_s)
+    assert max(later_s) == MOST_HOLD_S
+    for before, after in pairwise(shown):
+        assert not [
+            letter for letter, (was, now) in enumerate(zip(before, after, strict=True)) if was + now in ("Gr", "gr")
+        ]

@@ -89,7 +89,9 @@ class Heads:
             at_s += seconds
         heappush(self._due, (at_s, index, next(self._numbers), self.network.stages[stage].state, True))
         if self._inside is not None:
-            self._inside.leads(index, first, stage, at_s)
+            phases = self._ways[first, stage]
+            cleared = phases[-1][0] if phases else self.network.stages[first].state
+            self._inside.leads(index, first, stage, cleared, at_s)
         self.stage[index], self.begin_s[index] = stage, at_s
         self._ready_s[index] = at_s + self.network.stages[stage].least_green_s
         self.next_s = now_s

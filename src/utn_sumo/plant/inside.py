@@ -63,7 +63,7 @@ class Way:
     within: tuple[int, ...]
     """Turns onto roads within the junction that have green in the next stage."""
     outwards: str
-    """The letters of that stage with those red that do not lead off such roads."""
+    """The letters of that stage with those red that do not lead off such roads, but for who keeps green all along."""
 
 
 class Inside:
@@ -91,10 +91,10 @@ class Inside:
             [len(own) > 0 or each.is_walked or index in within for index, (own, each) in may], dtype=np.bool_
         )
 
-    def leads(self, index: int, first: int, then: int, opens_s: float) -> None:
-        """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`."""
+    def leads(self, index: int, first: int, then: int, cleared: str, opens_s: float) -> None:
+        """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`, after letters `cleared`."""
         if (index, first, then) not in self._known:
-            self._known[index, first, then] = self._way(index, first, then)
+            self._known[index, first, then] = self._way(index, first, then, cleared)
         self._ways[index] = self._known[index, first, then], opens_s + MOST_HOLD_S
         self._stuck[index] = set()
         self._look(index)
@@ -107,7 +107,7 @@ class Inside:
         stuck.update(turn for turn, _ in way.stopped if is_walked or stuck_veh(turn) > 0)
         return stuck
 
-    def _way(self, index: int, first: int, then: int) -> Way:
+    def _way(self, index: int, first: int, then: int, cleared: str) -> Way:
         network, junction, turnings = self._network, self._network.junctions[index], self._turnings[index]
         becomes = network.stages[then].state
         left = [
@@ -126,7 +126,7 @@ class Inside:
         )
         # To the stage that follows it is the net's own clearance, to the second, but for who walks or is stuck.
         is_own = then == following(junction, first)
-        within, outwards = _outwards(network, junction, becomes)
+        within, outwards = _outwards(network, junction, becomes, cleared)
         return Way(() if is_own else tuple(left), tuple(coming), stopped, within, outwards)
 
     def outwards(self, index: int) -> str:
@@ -151,16 +151,20 @@ class Inside:
         )
 
 
-def _outwards(network: Network, junction: Junction, state: str) -> tuple[tuple[int, ...], str]:
+def _outwards(network: Network, junction: Junction, state: str, cleared: str) -> tuple[tuple[int, ...], str]:
     """Turns onto roads within a junction off which a state lets, and that state with green for who leaves them alone.
 
-    None where nobody else has green in it.
+    And for who has had it in the letters before, `cleared`: without yellow nobody's ends. None where nobody else has
+    green in it.
     """
     leads = [
         {network.turns[turn].link for turn in turns if network.within[network.turns[turn].link]}
         for turns in junction.signal_turns
     ]
-    outwards = "".join(shown if off or shown not in GREEN else "r" for shown, off in zip(state, leads, strict=True))
+    outwards = "".join(
+        shown if off or shown not in GREEN or before in GREEN else "r"
+        for shown, off, before in zip(state, leads, cleared, strict=True)
+    )
     links = {link for shown, off in zip(state, leads, strict=True) if shown in GREEN for link in off}
     turns = tuple(index for index, turn in enumerate(network.turns) if turn.next_link in links)
     return (turns, outwards) if outwards != state else ((), "")
