@@ -523,6 +523,16 @@ def actuated(folder: Path) -> Path:
     return case(folder, traffic("AB"))
 
 
+def actuated_with_offsets(folder: Path) -> Path:
+    """The same with offsets, at which its cycles do not begin: its greens end as it thinks best."""
+    net = row("AB").net(folder, NO_TURNAROUNDS, "--tls.default-type", "actuated", "--tls.min-dur", "6")
+    tree = ET.parse(net)
+    for logic in tree.getroot().iter("tlLogic"):
+        logic.set("offset", "25")
+    tree.write(net)
+    return case(folder, traffic("AB"))
+
+
 def actuated_by_delay(folder: Path) -> Path:
     """SUMO's other actuation, by the time that vehicles lose."""
     row("AB").net(folder, NO_TURNAROUNDS, "--tls.default-type", "delay_based", "--tls.min-dur", "6")
@@ -972,6 +982,7 @@ CASES: tuple[Make, ...] = (
     one_stage,
     joined,
     actuated,
+    actuated_with_offsets,
     actuated_by_delay,
     actuated_left_turns,
     dual_ring,

@@ -42,6 +42,8 @@ from utn_sumo.plant.patience import LONGEST_RED_S, longest_red_s
 from utn_sumo.signals import cycle_phases
 
 PROGRAM = "utn"
+STATIC = 0
+"""SUMO's type of programmes of fixed times."""
 LOG = "sumo.log"
 """What SUMO complains of, in a run's folder."""
 
@@ -260,6 +262,8 @@ class SumoPlant:
 
     def _switch(self, plan: Plan) -> float:
         """Hand the plan over where a cycle begins now; when the next one does."""
+        if self.time_s == 0:
+            self._lead_in(plan)
         for index, boundary_s in enumerate(self._boundary_s):
             if boundary_s == self.time_s:
                 self._hand_over(index, plan.green_s)
@@ -342,6 +346,25 @@ class SumoPlant:
         ]
         lights.setProgramLogic(junction.id, lights.Logic(PROGRAM, 0, 0, phases))
         lights.setPhase(junction.id, 0)
+
+    def _lead_in(self, plan: Plan) -> None:
+        """Until a junction's first cycle begins show the end of one, where SUMO by itself would not be at its end then.
+
+        It is with programmes of fixed times, not with those whose greens SUMO ends as it thinks best.
+        """
+        lights = self._sumo.trafficlight
+        for index, (junction, until_s) in enumerate(zip(self.network.junctions, self._boundary_s, strict=True)):
+            types = {logic.programID: logic.type for logic in lights.getAllProgramLogics(junction.id)}
+            if until_s == 0 or types[lights.getProgram(junction.id)] == STATIC:
+                continue
+            self._hand_over(index, plan.green_s)
+            durations_s = [seconds for _, seconds in cycle_phases(self.network, index, plan.green_s)]
+            place, rest_s = len(durations_s) - 1, until_s
+            while rest_s > durations_s[place]:
+                rest_s -= durations_s[place]
+                place -= 1
+            lights.setPhase(junction.id, place)
+            lights.setPhaseDuration(junction.id, rest_s)
 
     def _by_link(self, getter: str) -> Floats:
         """The sum of a getter over each link's lanes for motor vehicles."""
