@@ -39,12 +39,12 @@ LEFT_ALONE: dict[Make, set[str]] = {
     odd_nets.no_yellow: {"A"},
     odd_nets.switched_off: {"A", "B", "D"},
     odd_nets.blinking_at_night: {"C"},
+    odd_nets.dual_ring: {"C"},
 }
 """Signals that nobody can control; every other one has to be controlled."""
 EITHER = {
     odd_nets.programmes_by_the_clock,
     odd_nets.phases_that_are_skipped,
-    odd_nets.dual_ring,
     odd_nets.fractions_of_seconds,
     odd_nets.fraction_in_the_cycle,
 }

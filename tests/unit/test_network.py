@@ -315,7 +315,7 @@ def test_a_net_with_no_signal_to_control_is_refused_with_the_reasons(town: Path,
     dull = [(text, text.splitlines()[0] + '\n<phase duration="90" state="rr"/>\n') for text in texts]
     line = one_line_of(str(edited(town, *dull)))
     assert "no signals that can be controlled" in line
-    assert "J1: its programme has no phase" in line
+    assert f"({', '.join(junction.id for junction in utn17.junctions)}: its programme has no phase" in line
 
 
 @pytest.mark.parametrize("packed", [False, True])

@@ -16,7 +16,7 @@ from utn_sumo.network.programmes import MIN_GREEN_S, SHORTEST_STAGE_S, Block, Ph
 
 
 def programme(*phases: tuple[float, str], offset_s: float = 0.0) -> Programme:
-    return Programme.of((Phase(state, seconds) for seconds, state in phases), offset_s)
+    return Programme.of((Phase(state, seconds) for seconds, state in phases), offset_s, "static")
 
 
 def states(blocks: list[Block]) -> list[tuple[str, tuple[str, ...]]]:
@@ -118,7 +118,7 @@ def test_a_stage_lasts_what_mindur_says_but_no_more_than_the_net_shows(
 
 def test_the_leasts_of_phases_alike_in_a_row_add_up() -> None:
     shown = [Phase("Gr", 20, 5.0), Phase("Gr", 10, 7.0), Phase("yr", 3), Phase("rG", 20), Phase("ry", 3)]
-    assert [block.stage.least_s for block in Programme.of(shown, 0).blocks] == [12, None]
+    assert [block.stage.least_s for block in Programme.of(shown, 0, "static").blocks] == [12, None]
 
 
 DURATIONS = st.integers(1, 30)

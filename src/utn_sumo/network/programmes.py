@@ -72,9 +72,11 @@ class Programme:
 
     phases: tuple[Phase, ...]
     offset_s: float
+    kind: str
+    """SUMO's type: static, actuated, NEMA and others."""
 
     @classmethod
-    def of(cls, phases: Iterable[Phase], offset_s: float) -> Programme:
+    def of(cls, phases: Iterable[Phase], offset_s: float, kind: str) -> Programme:
         """Of the phases as they are written."""
         grouped = [list(group) for _, group in groupby(phases, key=lambda phase: phase.state)]
         if len(grouped) > 1 and grouped[0][0].state == grouped[-1][0].state:
@@ -82,7 +84,7 @@ class Programme:
             last = grouped.pop()
             grouped[0] = [*last, *grouped[0]]
             offset_s -= sum(phase.duration_s for phase in last)
-        return cls(tuple(_merged(group) for group in grouped), offset_s)
+        return cls(tuple(_merged(group) for group in grouped), offset_s, kind)
 
     def yielding(self, second: Collection[tuple[int, int]]) -> Programme:
         """With g in place of G for the first of these pairs of letters, in phases in which both have G."""
@@ -155,7 +157,7 @@ def own(tls: Any) -> Programme | None:
         Phase(phase.state, float(phase.duration), float(phase.minDur) if phase.minDur >= 0 else None, bool(phase.next))
         for phase in program.getPhases()
     )
-    return Programme.of(phases, float(program.getOffset()))
+    return Programme.of(phases, float(program.getOffset()), program.getType())
 
 
 def added(files: Sequence[Path]) -> dict[str, Programme]:
@@ -167,7 +169,7 @@ def added(files: Sequence[Path]) -> dict[str, Programme]:
                 continue
             try:
                 shown = [_phase(element) for element in logic.iter("phase")]
-                found[logic.get("id")] = Programme.of(shown, float(logic.get("offset", "0")))
+                found[logic.get("id")] = Programme.of(shown, float(logic.get("offset", "0")), logic.get("type", ""))
             except ValueError as error:
                 raise NetworkError(
                     f"additional file {str(file)!r}: the programme of {logic.get('id')!r} has times that are no numbers"
@@ -220,8 +222,9 @@ def why_left_alone(programme: Programme | None, signals: int, motor: Collection[
     states = [phase.state for phase in programme.phases]
     if any(letter in OFF for state in states for letter in state):
         return SWITCHED_OFF
-    if any(phase.leads_elsewhere for phase in programme.phases):
-        return "its phases name their successors (next): there is no one cycle"
+    if programme.kind == "NEMA" or any(phase.leads_elsewhere for phase in programme.phases):
+        why = "it is of type NEMA" if programme.kind == "NEMA" else "its phases name their successors (next)"
+        return f"{why}: there is no one cycle"
     stages = len(programme.opens)
     if stages < 2:  # noqa: PLR2004 - what can be shared out
         few = "one stage: there is nothing to share out", "no phase that shows green without yellow"

@@ -105,7 +105,10 @@ def read(
     left_alone |= _sharing_approaches([signal for signal in signals if signal.id not in left_alone])
     controlled = [signal for signal in signals if signal.id not in left_alone]
     if not controlled:
-        reasons = "; ".join(f"{signal}: {reason}" for signal, reason in left_alone.items())
+        alike: dict[str, list[str]] = {}
+        for signal, reason in left_alone.items():
+            alike.setdefault(reason, []).append(signal)
+        reasons = "; ".join(f"{', '.join(own)}: {reason}" for reason, own in alike.items())
         raise NetworkError(f"net {str(path)!r} has no signals that can be controlled ({reasons})")
     reader = _Reader(net, controlled, _read_fractions(path), traffic, usual_green_s)
     return reader.network(path.resolve(), name, left_alone)
