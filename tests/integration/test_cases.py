@@ -15,7 +15,7 @@ from tests.integration import odd_nets
 from utn_sumo import bridge, case, forecast_report, replay, streets, traffic
 from utn_sumo.cli import cli
 from utn_sumo.contract import Network
-from utn_sumo.errors import ResultError, SettingError
+from utn_sumo.errors import PlantError, ResultError, SettingError
 from utn_sumo.scenario import scenario
 from utn_sumo.sumo_tools import sumo_binary
 
@@ -339,6 +339,19 @@ def test_the_command_takes_it_by_its_name_and_inspect_shows_its_net(town: Path, 
     assert "nobody departed" not in run.stdout
     shown = CliRunner().invoke(cli, ["inspect", str(town), "--out", str(tmp_path / "b"), "--json"])
     assert len(json.loads(shown.stdout)["links"]) == 17
+
+
+@pytest.mark.parametrize("controller", ["native", "fixed"])
+def test_why_sumo_does_not_start_is_its_own_to_say(
+    town: Path, tmp_path: Path, controller: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    loop = '<inductionLoop id="mine" lane="nowhere_0" pos="1" period="60" file="NUL"/>'
+    town.with_name("own.add.xml").write_text(f"<additional>{loop}</additional>", encoding="utf-8")
+    text = town.read_text(encoding="utf-8").replace("</input>", '<additional-files value="own.add.xml"/></input>')
+    town.write_text(text, encoding="utf-8")
+    with pytest.raises(PlantError, match=r"SUMO did not start \(see above\)"):
+        bridge.run(scenario(net=str(town), controller=controller), tmp_path / "run")
+    assert "nowhere_0" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("controller", ["native", "fixed"])

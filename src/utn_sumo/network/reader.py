@@ -86,7 +86,9 @@ def read(
             f"net {str(path)!r} can't be read ({reason}): give a .net.xml written by netconvert"
         ) from error
     if not net.getEdges():
-        raise NetworkError(f"net {str(path)!r} holds no roads: give a .net.xml written by netconvert")
+        raise NetworkError(
+            f"net {str(path)!r} holds no roads: give a .net.xml written by netconvert, or a scenario as .sumocfg"
+        )
     still = next((lane.getID() for edge in net.getEdges() for lane in edge.getLanes() if not lane.getSpeed() > 0), None)
     if still is not None:
         raise NetworkError(f"net {str(path)!r}: lane {still!r} has a speed of 0: give it one above")

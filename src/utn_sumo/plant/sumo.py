@@ -42,6 +42,8 @@ from utn_sumo.plant.patience import LONGEST_RED_S, longest_red_s
 from utn_sumo.signals import cycle_phases
 
 PROGRAM = "utn"
+NO_WORDS = "Process Error"
+"""What SUMO's errors say that it has written down elsewhere."""
 STATIC = 0
 """SUMO's type of programmes of fixed times."""
 LOG = "sumo.log"
@@ -138,9 +140,7 @@ class SumoPlant:
         try:
             libsumo.start(["sumo", *arguments])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-            raise PlantError(
-                f"SUMO did not start ({first_line(error)}): mend the scenario, see {self.folder / LOG}"
-            ) from error
+            raise did_not_start(error) from error
         self.sumo_time_s = time.perf_counter() - started
         SumoPlant._owner = self
         self._sumo = libsumo
@@ -459,6 +459,12 @@ def records(folder: Path, seed: int) -> list[str]:
         "--no-warnings",
         "--error-log", str(folder / LOG),
     ]  # fmt: skip
+
+
+def did_not_start(error: Exception) -> PlantError:
+    """What to raise for an error before the run; SUMO itself says of most on standard error what it is."""
+    said = first_line(error)
+    return PlantError(f"SUMO did not start ({'see above' if said == NO_WORDS else said}): mend the scenario")
 
 
 def broken_off(sumo: Any, error: Exception, log: Path) -> PlantError:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from utn_sumo.errors import PlantError
-from utn_sumo.plant.sumo import SumoPlant, broken_off, first_line
+from utn_sumo.plant.sumo import SumoPlant, broken_off, did_not_start
 
 LOOK_S = 10.0
 """Time between two looks at how full the roads are."""
@@ -62,7 +62,7 @@ def run(
     try:
         libsumo.start(["sumo", *arguments])
     except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-        raise PlantError(f"SUMO did not start ({first_line(error)}): mend the scenario, see {log}") from error
+        raise did_not_start(error) from error
     spent_s = time.perf_counter() - started
     try:
         roads = [edge for edge in libsumo.edge.getIDList() if not edge.startswith(":")]
