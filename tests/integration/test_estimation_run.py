@@ -157,7 +157,7 @@ class TestMiscountingLoops:
     def test_long_links_are_estimated_far_better_than_by_plain_counting(
         self, run_of: RunOf, record_property: Callable[[str, object], None]
     ) -> None:
-        folder = run_of(net="utn17-long", hours=4, demand=0.8, loop_error=LOOP_ERROR)[1]
+        folder = run_of(net="utn17-long", hours=2.5, demand=0.8, loop_error=LOOP_ERROR)[1]
         error = error_of(folder)
         report(record_property, error)
         assert rmse(error) <= rmse(error_of_plain_counting(folder)) / 3
