@@ -7,9 +7,10 @@ max_wave       the stage with most vehicles approaching (RESCO's MAXWAVE)
 max_pressure   the stage with most pressure: vehicles before it less those behind it (Varaiya 2013)
 priced         the stage that gains most by the vehicles that it can move within a short horizon, at prices of the links
 
-Whom a stage serves has way in it. Who gives way counts where no stage of the junction lets him go first: else whichever
-stage serves all, with left turns in the gaps of their opposites, would be worth as much as theirs, however long they
-wait.
+Whom a stage serves has way in it. Who gives way counts where no stage of the junction lets him go first, with all who
+share his lane: else whichever stage serves all, with left turns in the gaps of their opposites, would be worth as much
+as theirs, however long they wait. Where he shares his lane with some who have red in that stage it counts as well: else
+it would be worth most, and go on, while one of these stands in front.
 """
 
 from __future__ import annotations
@@ -25,12 +26,19 @@ from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network, Plan, State, V
 
 
 def served(network: Network) -> Bools:
-    """(S, M) turns that count for each stage: those that have way in it, or never have and give way in it."""
+    """(S, M) turns that count for each stage: those that have way in it, or give way in it and never have their way.
+
+    They do in a stage in which they have way and all go who share some lane with them.
+    """
     has_way = np.zeros_like(network.serves)
     for stage, shown in enumerate(network.stages):
         letters = zip(shown.state, network.junctions[shown.junction].signal_turns, strict=True)
         has_way[stage, [turn for letter, turns in letters if letter == HAS_WAY for turn in turns]] = True
-    return np.where(has_way.any(axis=0), has_way, network.serves)
+    goes = np.zeros_like(has_way)
+    for each in network.lane_sets:
+        turns = list(each.turns)
+        goes[:, turns] |= network.serves[:, turns].all(axis=1, keepdims=True)
+    return np.where((has_way & goes).any(axis=0), has_way, network.serves)
 
 
 class Acyclic:

@@ -54,6 +54,29 @@ def test_a_long_queue_for_a_left_turn_is_given_the_stage_in_which_it_has_way(
     assert (wish, through != protected) == (protected, True)
 
 
+def _shared(folder: Path) -> Path:
+    """Left turns give way in one stage and have way in the next, but share their road's only lane with all others."""
+    phases = [(20, "GGgrrrGGgrrr"), (3, "yygrrryygrrr"), (6, "rrGrrrrrGrrr"), (3, "rryrrrrryrrr")]
+    phases += [(20, "rrrGGgrrrGGg"), (3, "rrryyyrrryyy")]
+    net = odd_nets.row("C").net(folder, odd_nets.NO_TURNAROUNDS)
+    return odd_nets.retime(net, odd_nets.tl_logic("C", tuple(phases)))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_where_left_turns_share_a_lane_their_own_stage_is_worth_no_more_than_the_one_for_all(
+    street_of: StreetOf, rule: type[Acyclic]
+) -> None:
+    network = street_of(_shared)
+    through, own = network.junctions[0].stages[:2]
+    served = network.serves[through]
+    veh = np.where(np.isin(np.arange(len(network.groups)), network.turn_group[served]), 12.0, 0.0)
+    made = rule(network)
+    # Most turn left: whoever does not stands in front of them before red if their own stage goes on.
+    made.fraction = np.where(network.serves[own], 0.8, 0.1)
+    [wish] = made.wish(replace(queues(network, veh), stage=np.array([through])))
+    assert wish == through
+
+
 @pytest.mark.parametrize("rule", RULES)
 def test_with_nobody_anywhere_the_present_stage_stays(pockets: Network, rule: type[Acyclic]) -> None:
     for stage in pockets.junctions[0].stages:
