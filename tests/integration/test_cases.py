@@ -78,10 +78,11 @@ def test_without_an_end_it_runs_until_everybody_has_arrived(town: Path, tmp_path
     assert result["hours"] > 0.25
 
 
+@pytest.mark.long
 def test_without_an_end_controllers_run_until_everybody_has_arrived_too(tmp_path: Path) -> None:
     odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
     file = odd_nets.case(tmp_path, odd_nets.flow("rare", "W-C", "C-E", period=600, end=15600), end=None)
-    for controller in ("native", "recommended", "fixed"):
+    for controller in ("recommended", "fixed"):
         result = bridge.run(scenario(net=str(file), controller=controller), tmp_path / controller)
         assert (result["arrived"], result["unfinished"]) == (26, 0)
         assert result["hours"] > 4
@@ -165,6 +166,7 @@ def test_what_other_people_s_demand_does_not_take_is_refused(
     assert not (tmp_path / "run" / "result.json").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("controller", ["fixed", "dmpc", "cmpc"])
 def test_controllers_run_it_within_its_window(town: Path, tmp_path: Path, controller: str) -> None:
     result = bridge.run(scenario(net=str(town), controller=controller, seed=9), tmp_path / "run")

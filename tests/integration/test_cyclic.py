@@ -18,6 +18,7 @@ PEERS = ("tuc", "proportional", "cyclic_max_pressure")
 every_peer = pytest.mark.parametrize("controller", PEERS)
 
 
+@pytest.mark.long
 @every_peer
 def test_it_is_safe_needs_nobody_to_step_in_and_delays_less_than_equal_splits(
     controller: str, run_of: Callable[..., Any]

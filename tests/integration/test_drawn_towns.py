@@ -14,6 +14,7 @@ from utn_sumo import bridge, network
 from utn_sumo.scenario import scenario
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", range(4))
 def test_a_town_is_what_openstreetmap_has_and_its_signals_are_controlled_safely(number: int, tmp_path: Path) -> None:
     config = drawn_towns.write("town", tmp_path / "town", np.random.default_rng([21, number]))

@@ -72,6 +72,7 @@ def test_too_short_a_run_is_not_judged(tmp_path: Path) -> None:
     assert "'hours' is 0.2" in str(answer.exception)
 
 
+@pytest.mark.long
 def test_vehicles_that_come_amid_links_are_found_and_foretold(tmp_path: Path) -> None:
     told = tmp_path / "told"
     bridge.run(scenario(hours=1.5, demand=0.6, disturbance=120.0, seed=5), told)

@@ -66,6 +66,7 @@ def same_trips(original: Path, copy: Path, tmp_path: Path, controller: str, **se
     assert trips(tmp_path / "copy" / "trips.xml") == trips(tmp_path / "original" / "trips.xml")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("controller", ["native", "fixed", "dmpc"])
 def test_the_import_gives_the_trips_of_the_original_vehicle_for_vehicle(
     scattered: Path, tmp_path: Path, controller: str
@@ -168,6 +169,7 @@ def test_the_table_says_what_was_found_and_how_to_run_it(town: Path, tmp_path: P
     assert (tmp_path / "own" / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["cologne8/cologne8", "ingolstadt7/ingolstadt7", "bologna_acosta/run"])
 def test_other_people_s_scenarios_run_as_they_did(name: str, tmp_path: Path) -> None:
     file = SCENARIOS / f"{name}.sumocfg"

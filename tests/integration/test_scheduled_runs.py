@@ -320,6 +320,7 @@ def crossing(folder: Path, main_veh_h: tuple[int, ...], side_veh_h: tuple[int, .
     return odd_nets.case(folder, flows, end=str(end_s))
 
 
+@pytest.mark.long
 def test_a_lane_that_stands_behind_a_left_turn_does_not_keep_the_main_road_s_green(tmp_path: Path) -> None:
     # Of the main road 15 % turn left, from the inner of its two lanes.
     file = str(crossing(tmp_path, main_veh_h=(805, 172, 172), side_veh_h=(175, 38, 38), end_s=2400))
@@ -365,6 +366,7 @@ def test_whoever_waits_to_enter_a_main_road_between_two_signals_is_left_gaps(tmp
     assert delay["recommended"] < min(delay["actuated"], delay["delay_based"])
 
 
+@pytest.mark.long
 def test_a_dual_carriageway_does_not_lock_at_the_three_car_lengths_between_its_sides(tmp_path: Path) -> None:
     # One signal for both sides, 30 m apart; who turns left off a side waits between them, and stops a lane behind him.
     streets = odd_nets.Streets()
@@ -391,6 +393,7 @@ def test_a_dual_carriageway_does_not_lock_at_the_three_car_lengths_between_its_s
     assert delay["recommended"] < 0.95 * delay["actuated"]
 
 
+@pytest.mark.long
 def test_who_is_left_amid_a_junction_is_let_out_before_two_lanes_abreast_turn_left(tmp_path: Path) -> None:
     # Pockets of two lanes for left turns off the main road, of one off the side road; each has a stage of its own.
     streets = odd_nets.Streets()

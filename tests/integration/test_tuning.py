@@ -11,6 +11,7 @@ from utn_sumo import campaign, cli
 from utn_sumo.scenario import scenario
 
 
+@pytest.mark.long
 def test_a_short_search_finds_settings_that_are_worth_what_it_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

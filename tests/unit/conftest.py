@@ -13,7 +13,7 @@ from utn_sumo import network
 from utn_sumo.contract import Network
 
 
-@pytest.fixture(params=["utn17", "utn17-long"], scope="module")
+@pytest.fixture(params=["utn17", pytest.param("utn17-long", marks=pytest.mark.long)], scope="module")
 def net(request: pytest.FixtureRequest, utn17: Network, utn17_long: Network) -> Network:
     return utn17 if request.param == "utn17" else utn17_long
 
