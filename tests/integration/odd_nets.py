@@ -608,6 +608,14 @@ def offsets(folder: Path) -> Path:
     return case(folder, traffic("ABD"))
 
 
+def coordinated(folder: Path) -> Path:
+    """Offsets as tlsCoordinator writes them: programmes without phases in an additional file."""
+    net = row("AB").net(folder, NO_TURNAROUNDS)
+    retime(net, *(tl_logic(name, TWO_STAGES, offset=10) for name in "AB"))
+    moved = (f'<tlLogic id="{name}" programID="0" offset="{offset}"/>' for name, offset in (("A", 30), ("B", 50)))
+    return case(folder, traffic("AB"), "".join(moved))
+
+
 def fractions_of_seconds(folder: Path) -> Path:
     """Clearances of 2.5 s and an offset of 4.5 s at A, in a cycle of whole seconds; B is as usual."""
     shown = [(2.5 if "G" not in state else seconds, state) for seconds, state in TWO_STAGES]
@@ -992,6 +1000,7 @@ CASES: tuple[Make, ...] = (
     programmes_by_the_clock,
     phases_that_are_skipped,
     offsets,
+    coordinated,
     fractions_of_seconds,
     fraction_in_the_cycle,
     right_on_red,

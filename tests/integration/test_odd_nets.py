@@ -158,7 +158,10 @@ def programmes(file: Path) -> dict[str, Shown]:
             while phases and (after := int(phases[reached[-1]].get("next", reached[-1] + 1)) % len(phases)):
                 reached.append(after)
             shows = [(item.attrib["state"], float(item.attrib["duration"])) for item in phases]
-            found[logic.attrib["id"]] = [shows[place] for place in reached] if shows else []
+            # Without phases it only moves the one before.
+            found[logic.attrib["id"]] = (
+                [shows[place] for place in reached] if shows else found.get(logic.attrib["id"], [])
+            )
     return found
 
 

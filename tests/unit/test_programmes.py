@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 
@@ -209,9 +211,14 @@ def logic(signal: str, *phases: str, head: str = 'programID="1" offset="4"') -> 
     return f'<tlLogic id="{signal}" type="static" {head}>{"".join(f"<phase {said}/>" for said in phases)}</tlLogic>'
 
 
+def added(file: Path, of_net: Mapping[str, Programme | None] | None = None) -> dict[str, Programme]:
+    found = programmes.added([file], of_net or {})
+    return {signal: each for signal, each in found.items() if each is not None}
+
+
 def test_programmes_of_additional_files_are_read_with_leasts_and_offset(tmp_path: Path) -> None:
     phases = 'duration="20" state="Gr" minDur="7"', 'duration="3" state="yr"', 'duration="25" state="rG"'
-    found = programmes.added([written(tmp_path, logic("C", *phases))])
+    found = added(written(tmp_path, logic("C", *phases)))
     assert set(found) == {"C"}
     assert found["C"].offset_s == 4
     assert [phase.least_s for phase in found["C"].phases] == [7, None, None]
@@ -220,7 +227,23 @@ def test_programmes_of_additional_files_are_read_with_leasts_and_offset(tmp_path
 def test_of_two_programmes_for_a_signal_the_last_one_stands(tmp_path: Path) -> None:
     first, second = logic("C", 'duration="20" state="Gr"'), logic("C", 'duration="30" state="rG"')
     nothing = logic("C", head='programID="off"')
-    assert programmes.added([written(tmp_path, first, second, nothing)])["C"].phases == (Phase("rG", 30),)
+    assert added(written(tmp_path, first, second, nothing))["C"].phases == (Phase("rG", 30),)
+
+
+def test_a_programme_without_phases_moves_the_one_of_its_id(tmp_path: Path) -> None:
+    shown = Phase("Gr", 12), Phase("yr", 3), Phase("rG", 20), Phase("ry", 3), Phase("Gr", 8)
+    own = Programme.of(shown, 5.0, "static", "0")
+    moved, other = (f'<tlLogic id="{signal}" programID="0" offset="50"/>' for signal in "CD")
+    found = added(written(tmp_path, moved, other), {"C": own, "D": replace(own, id="1"), "E": None})
+    # The last phase goes on as the first one.
+    assert [own.offset_s, found["C"].offset_s, found["D"].offset_s] == [-3, 42, -3]
+    assert found["C"].phases == own.phases
+    # Without an offset SUMO takes it to be 0.
+    plain = '<tlLogic id="C" programID="0"><param key="detector-gap" value="2"/></tlLogic>'
+    assert added(written(tmp_path, plain), {"C": own})["C"].offset_s == -8
+    later = logic("C", 'duration="30" state="rG"', head='programID="0" offset="7"')
+    for order, offset_s in (((moved, later), 7), ((later, moved), 50)):
+        assert added(written(tmp_path, *order), {"C": own})["C"].offset_s == offset_s
 
 
 def test_a_programme_of_an_additional_file_whose_phases_name_their_successors_is_left_alone(tmp_path: Path) -> None:
@@ -230,7 +253,7 @@ def test_a_programme_of_an_additional_file_whose_phases_name_their_successors_is
         'duration="25" state="rG"',
         'duration="3" state="ry"',
     )
-    found = programmes.added([written(tmp_path, logic("C", *phases))])["C"]
+    found = added(written(tmp_path, logic("C", *phases)))["C"]
     assert "next" in programmes.why_left_alone(found, 2, (), ())
 
 
@@ -241,17 +264,17 @@ def test_what_an_additional_file_includes_stands_where_it_is_included(tmp_path: 
     said = '<include href="sub/signals.add.xml"/>'
     before, after = logic("B", 'duration="30" state="rG"'), logic("A", 'duration="30" state="rG"')
     file = written(tmp_path, before, said)
-    assert programmes.added([file])["B"].phases == (Phase("Gr", 20),)
+    assert added(file)["B"].phases == (Phase("Gr", 20),)
     assert set(programmes.switched_elsewhere([file])) == {"A"}
     file = written(tmp_path, said, before, after)
-    assert programmes.added([file])["B"].phases == (Phase("rG", 30),)
+    assert added(file)["B"].phases == (Phase("rG", 30),)
     assert not programmes.switched_elsewhere([file])
 
 
 @pytest.mark.parametrize("said", ['duration="soon" state="Gr"', 'state="Gr"', 'duration="9" state="Gr" minDur="x"'])
 def test_times_that_are_no_numbers_are_refused_in_one_line(tmp_path: Path, said: str) -> None:
     with pytest.raises(NetworkError, match="no numbers") as caught:
-        programmes.added([written(tmp_path, logic("C", said))])
+        added(written(tmp_path, logic("C", said)))
     assert "\n" not in str(caught.value)
 
 

@@ -9,7 +9,7 @@ seconds is a stage only if nobody else lets go whom it does.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -74,17 +74,25 @@ class Programme:
     offset_s: float
     kind: str
     """SUMO's type: static, actuated, NEMA and others."""
+    id: str = ""
+    """Its `programID`."""
+    turned_s: float = 0.0
+    """How much of its first phase is written as its last one."""
 
     @classmethod
-    def of(cls, phases: Iterable[Phase], offset_s: float, kind: str) -> Programme:
+    def of(cls, phases: Iterable[Phase], offset_s: float, kind: str, name: str = "") -> Programme:
         """Of the phases as they are written."""
-        grouped = [list(group) for _, group in groupby(phases, key=lambda phase: phase.state)]
+        grouped, turned_s = [list(group) for _, group in groupby(phases, key=lambda phase: phase.state)], 0.0
         if len(grouped) > 1 and grouped[0][0].state == grouped[-1][0].state:
             # A phase that goes on round the cycle is one.
             last = grouped.pop()
             grouped[0] = [*last, *grouped[0]]
-            offset_s -= sum(phase.duration_s for phase in last)
-        return cls(tuple(_merged(group) for group in grouped), offset_s, kind)
+            turned_s = sum(phase.duration_s for phase in last)
+        return cls(tuple(_merged(group) for group in grouped), offset_s - turned_s, kind, name, turned_s)
+
+    def moved(self, offset_s: float) -> Programme:
+        """With another offset, as it is written."""
+        return replace(self, offset_s=offset_s - self.turned_s)
 
     def yielding(self, second: Collection[tuple[int, int]]) -> Programme:
         """With g in place of G for the first of these pairs of letters, in phases in which both have G."""
@@ -150,26 +158,31 @@ def _is_remnant(phase: Phase, before: Phase) -> bool:
 
 def own(tls: Any) -> Programme | None:
     """The net's own programme of a signal (a sumolib TLS), if it has one."""
-    program = next(iter(tls.getPrograms().values()), None)
+    name, program = next(iter(tls.getPrograms().items()), ("", None))
     if program is None or not program.getPhases():
         return None
     phases = (
         Phase(phase.state, float(phase.duration), float(phase.minDur) if phase.minDur >= 0 else None, bool(phase.next))
         for phase in program.getPhases()
     )
-    return Programme.of(phases, float(program.getOffset()), program.getType())
+    return Programme.of(phases, float(program.getOffset()), program.getType(), name)
 
 
-def added(files: Sequence[Path]) -> dict[str, Programme]:
-    """Signal programmes in additional files, by signal: the last one read stands, as in SUMO."""
-    found = {}
+def added(files: Sequence[Path], of_net: Mapping[str, Programme | None]) -> dict[str, Programme | None]:
+    """Programmes by signal: those `of_net`, or of those in additional files the last one read, as in SUMO.
+
+    One without phases, as tlsCoordinator writes them, gives that of the same `programID` another offset.
+    """
+    found = dict(of_net)
     for file in files:
         for logic in _elements(file, "tlLogic"):
-            if logic.find("phase") is None:
-                continue
+            signal, name, before = logic.get("id"), logic.get("programID", ""), found.get(logic.get("id"))
             try:
-                shown = [_phase(element) for element in logic.iter("phase")]
-                found[logic.get("id")] = Programme.of(shown, float(logic.get("offset", "0")), logic.get("type", ""))
+                offset_s, shown = float(logic.get("offset", "0")), [_phase(each) for each in logic.iter("phase")]
+                if shown:
+                    found[signal] = Programme.of(shown, offset_s, logic.get("type", ""), name)
+                elif before is not None and before.id == name:
+                    found[signal] = before.moved(offset_s)
             except ValueError as error:
                 raise NetworkError(
                     f"additional file {str(file)!r}: the programme of {logic.get('id')!r} has times that are no numbers"

@@ -95,7 +95,7 @@ def read(
     lights = sorted(net.getTrafficLights(), key=lambda tls: _natural(tls.getID()))
     if not lights:
         raise NetworkError(f"net {str(path)!r} has no traffic lights: there is nothing to control")
-    known = {tls.getID(): programmes.own(tls) for tls in lights} | programmes.added(additional)
+    known = programmes.added(additional, {tls.getID(): programmes.own(tls) for tls in lights})
     foreign = programmes.switched_elsewhere(additional)
     walked = crossings(path)
     signals = [Signal(net, tls, known[tls.getID()], walked.get(tls.getID(), [])) for tls in lights]
