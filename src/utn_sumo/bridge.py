@@ -75,7 +75,7 @@ def run(
     if alone := sumo_signals.RUNS.get(scenario.controller):
         return alone(scenario, folder, on_cycle and (lambda *seen: on_cycle(_progress(*seen))))
     chosen = traffic.given(scenario) if scenario.net.endswith(SUFFIX) else None
-    net = streets.named(scenario.net) if chosen is None else streets.controllable(chosen)
+    net = streets.named(scenario.net) if chosen is None else streets.taken_over(chosen)
     # Controller and model see the calibrated links; plant, demand and counting go by the real ones.
     known = calibration.for_model(net, scenario.calibration)
     controller = controllers.build(scenario.controller, known, scenario.controller_settings)

@@ -46,6 +46,19 @@ def controllable(chosen: Case, usual_green_s: float = network.MIN_GREEN_S) -> Ne
     return replace(net, junctions=tuple(junctions))
 
 
+def taken_over(chosen: Case, usual_green_s: float = network.MIN_GREEN_S) -> Network:
+    """The same for a run whose signals are switched by somebody else than the net's own programmes.
+
+    Raises SettingError too for one that begins with a saved state: what has green in it would lose it without yellow.
+    """
+    if dict(chosen.options).get("load-state"):
+        raise SettingError(
+            f"scenario {str(chosen.file)!r} has load-state, which has signals amid programmes of its own: leave it out "
+            "and begin earlier, or use --controller native"
+        )
+    return controllable(chosen, usual_green_s)
+
+
 def _with_refused_left_alone(
     name: str,
     additional: Sequence[Path] = (),

@@ -120,7 +120,7 @@ def run(
     """Run a scenario under one of the `PEERS`; see `native.measured`. Raises UtnError."""
     peer = controllers.made(scenario.controller, PEERS[scenario.controller], scenario.settings)
     chosen = native.of(scenario)
-    network, logics = peer.programmes(streets.controllable(chosen, peer.min_green_s), chosen)
+    network, logics = peer.programmes(streets.taken_over(chosen, peer.min_green_s), chosen)
     root = ET.Element("additional")
     root.extend(logics)
     ET.indent(root)

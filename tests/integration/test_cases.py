@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import subprocess
 from pathlib import Path
@@ -86,6 +87,37 @@ def test_without_an_end_controllers_run_until_everybody_has_arrived_too(tmp_path
         result = bridge.run(scenario(net=str(file), controller=controller), tmp_path / controller)
         assert (result["arrived"], result["unfinished"]) == (26, 0)
         assert result["hours"] > 4
+
+
+def test_files_that_options_name_lie_where_the_scenario_does(tmp_path: Path) -> None:
+    odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    names = {"device.fcd-replay.files": "seen.xml", "astar.all-distances": "table.txt"}
+    (tmp_path / "seen.xml").write_text("<fcd-export/>", encoding="utf-8")
+    (tmp_path / "table.txt").write_text("no XML", encoding="utf-8")
+    chosen = case.read(odd_nets.case(tmp_path, odd_nets.traffic("C"), options=names))
+    assert dict(chosen.options) | {name: str(tmp_path / said) for name, said in names.items()} == dict(chosen.options)
+    assert {tmp_path / said for said in names.values()} <= set(chosen.files)
+
+
+def test_a_saved_state_is_gone_on_from_by_the_net_s_own_signals_alone(tmp_path: Path) -> None:
+    net = odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    file = odd_nets.case(tmp_path, odd_nets.traffic("C"))
+    save = ["--save-state.times", "100", "--save-state.files", str(tmp_path / "state.xml.gz"), "--end", "101"]
+    command = [sumo_binary("sumo"), "-n", str(net), "-r", str(tmp_path / "odd.rou.xml"), "--no-step-log"]
+    subprocess.run([*command, *save], check=True, capture_output=True)
+    text = file.read_text(encoding="utf-8")
+    file.write_text(text.replace("<end", '<load-state value="state.xml.gz"/><end'), encoding="utf-8")
+    result = bridge.run(scenario(net=str(file), controller="native"), tmp_path / "native")
+    # SUMO's clock goes on from where it was, whatever the window says.
+    assert result["hours"] == pytest.approx(200 / 3600)
+    assert (result["unsafe_signal_s"], result["unsafe_reasons"]) == (0, [])
+    for controller in ("fixed", "recommended", "actuated", "webster"):
+        with pytest.raises(SettingError, match=r"load-state, .*: leave it out .* or use --controller native"):
+            bridge.run(scenario(net=str(file), controller=controller), tmp_path / controller)
+        assert not (tmp_path / controller).exists()
+    (tmp_path / "state.xml.gz").write_bytes(gzip.compress(b"<routes/>"))
+    with pytest.raises(SettingError, match=r"state.xml.gz' as load-state, which is none"):
+        case.read(file)
 
 
 @pytest.mark.parametrize("step_s", ["2", "0.9", "0.4", "0.2"])
