@@ -35,22 +35,26 @@ WRITTEN = re.compile(
 NOWHERE = "NUL"
 """The file that SUMO writes nothing to."""
 LEFT = frozenset({"max-depart-delay", "max-num-teleports", "remote-port", "num-clients"})
+LEFT |= {"xml-validation", "xml-validation.net", "xml-validation.routes"}
 """Options that no run has: who waits long to enter goes on waiting, since a controller that keeps more vehicles out
-would look better without them, as one would that ends its run early; and nobody else's programme steers SUMO."""
+would look better without them, as one would that ends its run early; nobody else's programme steers SUMO; and our own
+files name no schema."""
 RECORDED = "device.tripinfo.probability"
 """Option by which trips are left off the record: every trip is on it. SUMO still draws a number for each vehicle where
 it is said, so that who has other devices stays the same."""
 SEEDS = frozenset({"seed", "random"})
 OURS = frozenset({"net-file", "route-files", "additional-files", "begin", "end", *SEEDS})
 """Options that other fields of a `Case` stand for."""
-TABLES = ("astar.all-distances", "astar.landmark-distances")
+TABLES = ("astar.all-distances", "astar.landmark-distances", "device.ssm.filter-edges.input-file")
 FILES = ("weight-files", "load-state", "device.fcd-replay.files", *TABLES)
 """Further options that name files to read, of XML but for `TABLES`."""
 LONG = {"n": "net-file", "r": "route-files", "a": "additional-files", "b": "begin", "e": "end", "w": "weight-files"}
 LONG |= {"net": "net-file", "routes": "route-files", "additional": "additional-files", "weights": "weight-files"}
 LONG |= {"W": "no-warnings", "v": "verbose", "l": "log", "p": "print-options", "C": "save-configuration"}
-LONG |= {"H": "human-readable-time"}
+LONG |= {"H": "human-readable-time", "t": "duration-log.statistics", "X": "xml-validation"}
 """SUMO's short and older names of options."""
+ON = frozenset({"1", "yes", "true", "on", "x", "t"})
+"""What SUMO takes for switched on, in letters of any case."""
 UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 
 
@@ -78,6 +82,10 @@ class Case:
     def step_s(self) -> float:
         """Length of SUMO's steps."""
         return seconds(dict(self.options).get("step-length", "1"))
+
+    def switches_on(self, name: str) -> bool:
+        """Whether it has an option that is on or off switched on."""
+        return dict(self.options).get(name, "").strip().lower() in ON
 
     @property
     def scale(self) -> float:

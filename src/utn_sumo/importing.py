@@ -161,7 +161,8 @@ def _write_scenario(path: Path, chosen: Case, copies: _Copies) -> None:
         "random_number": dict(chosen.seeds),
     }
     root = ET.Element("configuration")
-    for name, options in sections.items():
+    # A section without options SUMO takes for an option without a value.
+    for name, options in ((name, options) for name, options in sections.items() if options):
         section = ET.SubElement(root, name)
         for option, value in options.items():
             ET.SubElement(section, option, value=value)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import NamedTuple, NoReturn, TypeVar, overload
 from xml.etree.ElementTree import Element
@@ -86,6 +86,10 @@ CALLED = WHENEVER - {"begin"}
 """Those that somebody has to call for: a person, a container, a train, a programme."""
 ROUNDING_VEH = 1e-6
 """What the times of a flow's departures are uncertain by, in vehicles."""
+MOST_VEH_S = 1e6
+"""More than anybody means."""
+PLACES = ("busStop", "trainStop", "parkingArea", "containerStop", "chargingStation")
+"""Elements that a stop may name, in an attribute of the same name."""
 DRIVES, WAYS = frozenset({"vehicle", "trip", "flow"}), frozenset({"route", "routeDistribution"})
 
 
@@ -99,7 +103,7 @@ def read(case: Case) -> Traffic:
 
 def check(case: Case, traffic: Traffic) -> None:
     """Raise SettingError if somebody drives on an edge that the net has not, unless SUMO is told to put up with it."""
-    if dict(case.options).get("ignore-route-errors", "false") != "false":
+    if case.switches_on("ignore-route-errors"):
         return
     missing = dict(traffic.named_by)
     for element in cases.elements(case.net_file, "net-file"):
@@ -148,6 +152,8 @@ class _Reader:
         self.by_route: dict[str, tuple[float, str]] = {}
         """Vehicles on a named route, and who names it first."""
         self.by_type: dict[str, tuple[float, str]] = {}
+        self.places: dict[str, str] = {}
+        """Lanes of bus stops and the like, by id."""
 
     def read(self, path: Path) -> None:
         """Add a file."""
@@ -162,6 +168,8 @@ class _Reader:
                 self.kinds[name] = self._distribution(element, "vTypes", self.kinds, self._kind)
             elif element.tag in DRIVES:
                 self._ride(element)
+            elif element.tag in PLACES:
+                self.places[name] = element.get("lane", "")
 
     def traffic(self) -> Traffic:
         """What has been read."""
@@ -211,10 +219,20 @@ class _Reader:
             before, first = self.by_route.get(route, (0.0, who))
             self.by_route[route] = before + veh, first
         else:
-            stops = " ".join(element.get(name, "") for name in ("from", "via", "to")).split()
-            self.trips_veh[tuple(stops)] += veh
-            for edge in stops:
+            via = [element.get("via", ""), *self._stops(element)]
+            passed = " ".join([element.get("from", ""), *via, element.get("to", "")]).split()
+            self.trips_veh[tuple(passed)] += veh
+            for edge in passed:
                 self.named_by.setdefault(edge, who)
+
+    def _stops(self, element: Element) -> list[str]:
+        """The edges on which somebody stops, as far as it is known where; one after the other once alone."""
+        edges = []
+        for stop in element.iter("stop"):
+            place = next((stop.attrib[kind] for kind in PLACES if kind in stop.attrib), "")
+            lane = stop.get("lane") or self.places.get(place, "")
+            edges.append(stop.get("edge") or lane.rpartition("_")[0])
+        return [edge for edge, _ in groupby(filter(None, edges))]
 
     def _drive(self, way: _Way, veh: float, who: str) -> None:
         for edge in way.edges:
@@ -246,6 +264,8 @@ class _Reader:
             rate_veh_s = number / (end_s - begin_s)
         elif number is not None:
             end_s = begin_s + number / rate_veh_s
+        if rate_veh_s > MOST_VEH_S:
+            self._refuse(element, f"has more than {MOST_VEH_S:g} vehicles a second: give fewer")
         by_chance = "probability" in element.attrib or element.get("period", "").startswith("exp")
 
         def until_veh(time_s: float) -> float:

@@ -30,7 +30,7 @@ def controllable(chosen: Case, usual_green_s: float = network.MIN_GREEN_S) -> Ne
     Raises SettingError for a mesoscopic case, where there are no lanes to watch, and for steps with which signals can't
     be switched to the second.
     """
-    if dict(chosen.options).get("mesosim", "false") == "true":
+    if chosen.switches_on("mesosim"):
         raise SettingError(
             f"scenario {str(chosen.file)!r} has mesosim, which knows no lanes: leave it out, or use --controller native"
         )

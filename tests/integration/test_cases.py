@@ -89,6 +89,16 @@ def test_without_an_end_controllers_run_until_everybody_has_arrived_too(tmp_path
         assert result["hours"] > 4
 
 
+@pytest.mark.parametrize("word", ["true", "True", "1", "x", "on"])
+def test_options_are_on_by_any_of_sumo_s_words(tmp_path: Path, word: str) -> None:
+    odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    chosen = case.read(odd_nets.case(tmp_path, odd_nets.traffic("C"), options={"mesosim": word}))
+    with pytest.raises(SettingError, match="mesosim"):
+        streets.controllable(chosen)
+    off = case.read(odd_nets.case(tmp_path, odd_nets.traffic("C"), options={"mesosim": "False"}))
+    assert streets.controllable(off).links
+
+
 def test_files_that_options_name_lie_where_the_scenario_does(tmp_path: Path) -> None:
     odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
     names = {"device.fcd-replay.files": "seen.xml", "astar.all-distances": "table.txt"}

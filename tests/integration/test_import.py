@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.integration import odd_nets
 
 from utn_sumo import bridge, case, importing, network
 from utn_sumo.cli import cli
@@ -124,6 +125,13 @@ def test_what_lies_beside_the_net_comes_with_it(town: Path, utn17: Network, tmp_
         assert (tmp_path / "own" / name).read_bytes() == utn17.net_file.with_name(name).read_bytes()
     assert result["calibration"].endswith("utn17.calibration.json")
     same_trips(town, tmp_path / "own" / "scenario.sumocfg", tmp_path, "dmpc", hours=0.1)
+
+
+def test_what_is_imported_has_no_section_that_sumo_takes_for_an_option(tmp_path: Path) -> None:
+    odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    imported(odd_nets.case(tmp_path, odd_nets.traffic("C")), tmp_path / "own")
+    command = [sumo_binary("sumo"), "-c", str(tmp_path / "own" / "scenario.sumocfg"), "--no-step-log", "--end", "1"]
+    assert "Error" not in subprocess.run(command, check=True, capture_output=True, text=True).stderr
 
 
 def test_a_state_and_weights_that_options_name_are_copied_too(town: Path, tmp_path: Path) -> None:

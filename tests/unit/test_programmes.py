@@ -271,7 +271,10 @@ def test_what_an_additional_file_includes_stands_where_it_is_included(tmp_path: 
     assert not programmes.switched_elsewhere([file])
 
 
-@pytest.mark.parametrize("said", ['duration="soon" state="Gr"', 'state="Gr"', 'duration="9" state="Gr" minDur="x"'])
+@pytest.mark.parametrize(
+    "said",
+    ['duration="1e999" state="Gr"', 'duration="soon" state="Gr"', 'state="Gr"', 'duration="9" state="Gr" minDur="x"'],
+)
 def test_times_that_are_no_numbers_are_refused_in_one_line(tmp_path: Path, said: str) -> None:
     with pytest.raises(NetworkError, match="no numbers") as caught:
         added(written(tmp_path, logic("C", said)))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 
 from tests.integration import odd_nets
 from tests.integration.odd_nets import ARM_M, NO_TURNAROUNDS, TWO_STAGES, Streets, retime, row, tl_logic
+from utn_sumo import network
 from utn_sumo.contract import EXIT, Link, Network
 from utn_sumo.network import MOTOR, roads
 from utn_sumo.network.lanes import lane_groups
@@ -330,6 +332,14 @@ def test_lanes_for_motors_are_those_that_any_motor_vehicle_may_use(street_of: St
     edge = sumolib.net.readNet(str(net_of(kinds_of_lanes))).getEdge("W-C")
     assert roads.motor_lanes(edge) == (1, 2)
     assert link(street_of(kinds_of_lanes), "W-C").lanes == 2
+
+
+def test_a_link_is_as_fast_as_its_leftmost_lane_for_motors(net_of: NetOf, tmp_path: Path) -> None:
+    tree = ET.parse(net_of(kinds_of_lanes))
+    for number, speed_m_s in enumerate((4.0, 8.0, 10.0, 1.5)):
+        tree.find(f".//lane[@id='W-C_{number}']").set("speed", f"{speed_m_s}")  # type: ignore[union-attr]
+    tree.write(tmp_path / "speeds.net.xml")
+    assert link(network.load(str(tmp_path / "speeds.net.xml")), "W-C").free_speed_m_s == pytest.approx(10)
 
 
 @pytest.mark.parametrize("users", MOTOR)

@@ -159,6 +159,21 @@ def test_those_whose_way_sumo_finds_are_counted_apart(tmp_path: Path) -> None:
     assert found.named_by["d"].startswith("flow 'f' of ")
 
 
+def test_who_stops_on_the_way_is_sent_by_there(tmp_path: Path) -> None:
+    found = traffic(
+        tmp_path,
+        '<busStop id="s" lane="e_x_0"/><trip id="t" depart="1" from="a" via="b" to="d">'
+        '<stop lane="c_1" duration="5"/><stop lane="c_0" duration="5"/><stop busStop="s" duration="5"/></trip>'
+        '<flow id="f" number="9" from="a" to="d"><stop edge="a"/><stop parkingArea="nowhere" duration="5"/></flow>',
+    )
+    assert found.trips_veh == {("a", "b", "c", "e_x", "d"): 1, ("a", "a", "d"): 9}
+
+
+def test_a_flow_of_more_than_anybody_means_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"flow 'f' of .* vehicles a second: give fewer"):
+        traffic(tmp_path, '<flow id="f" period="1e-320" end="9" from="a" to="d"/>')
+
+
 def test_room_is_the_mean_of_what_drives(tmp_path: Path) -> None:
     found = traffic(
         tmp_path,

@@ -222,6 +222,8 @@ def _elements(file: Path, tag: str) -> Iterator[Any]:
 def _phase(element: Any) -> Phase:
     least, elsewhere = element.get("minDur"), bool((element.get("next") or "").strip())
     duration_s = float(element.get("duration", ""))
+    if not math.isfinite(duration_s):
+        raise ValueError(element.get("duration"))
     return Phase(element.get("state", ""), duration_s, None if least is None else float(least), elsewhere)
 
 

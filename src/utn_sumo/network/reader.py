@@ -18,7 +18,7 @@ from utn_sumo.errors import NetworkError, did_you_mean
 from utn_sumo.network import programmes
 from utn_sumo.network.lanes import lane_groups, lane_sets
 from utn_sumo.network.programmes import MIN_GREEN_S, SHORT_GREEN_S, Block, Phase
-from utn_sumo.network.roads import Chain, Roads, for_motors, leads_on, motor_lanes, reserved_lanes, usual_weight
+from utn_sumo.network.roads import Chain, Roads, for_motors, free_s, leads_on, motor_lanes, reserved_lanes, usual_weight
 from utn_sumo.network.sides import side_roads
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
@@ -250,7 +250,7 @@ class _Reader:
             junction=self.junction_of[chain.edges[-1]],
             lanes=lanes[-1],
             length_m=length,
-            free_speed_m_s=length / sum(edge.getLength() / edge.getSpeed() for edge in edges),
+            free_speed_m_s=length / sum(map(free_s, edges)),
             storage_veh=max(lanes[-1] * LEAST_STORAGE_VEH_LANE, lane_m / self.space_m),
             queue_spacing_m=self.space_m * length / lane_m,
             saturation_flow_veh_s=lanes[-1] * SATURATION_FLOW_VEH_S_LANE,
@@ -411,7 +411,9 @@ def _read_fractions(net_path: Path) -> dict[tuple[str, str], float]:
         relations = ElementTree.parse(path).iter("edgeRelation")
         fractions = {(r.get("from"), r.get("to")): float(r.get("probability")) for r in relations}
     except (ElementTree.ParseError, DefusedXmlException, TypeError, ValueError) as error:
-        raise NetworkError(f"turning fractions {str(path)!r} can't be read ({error})") from error
+        raise NetworkError(
+            f"turning fractions {str(path)!r} can't be read ({error}): give edgeRelations with from, to and probability"
+        ) from error
     for (start, end), value in fractions.items():
         if not 0 <= value < math.inf:
             raise NetworkError(f"turning fractions {str(path)!r}: {start} to {end} is {value:g}: give 0 or more")

@@ -10,7 +10,10 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-MOTOR = ("passenger", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped", "emergency")
+MOTOR = (
+    "passenger", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped", "emergency", "private",
+    "hov", "evehicle", "custom1", "custom2",
+)  # fmt: skip
 """SUMO's vehicle classes that a lane for motor vehicles has one of, at least."""
 TURNAROUND = "t"
 STRAIGHT = "s"
@@ -26,6 +29,13 @@ def motor_lanes(edge: Any) -> tuple[int, ...]:
 def reserved_lanes(edge: Any) -> frozenset[int]:
     """Numbers of its lanes for motor vehicles that no car may use, as those for buses."""
     return frozenset(index for index in motor_lanes(edge) if not edge.getLane(index).allows("passenger"))
+
+
+def free_s(edge: Any) -> float:
+    """Time that a motor vehicle drives on an edge (sumolib), by the leftmost lane for it."""
+    lanes = motor_lanes(edge)
+    speed_m_s = edge.getLane(lanes[-1]).getSpeed() if lanes else edge.getSpeed()
+    return float(edge.getLength() / speed_m_s)
 
 
 def _admits_motors(lane: Any) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 from utn_sumo.contract import SideRoad
-from utn_sumo.network.roads import for_motors, main_road
+from utn_sumo.network.roads import for_motors, free_s, main_road
 
 REACH_M = 300.0
 """As far behind a signal as its platoons, and the gaps between them, last."""
@@ -47,7 +47,7 @@ def _along(edge: Any) -> Iterator[tuple[str, list[str], float]]:
     while edge is not None and edge.getID() not in seen:
         seen.add(edge.getID())
         after_m += edge.getLength()
-        after_s += edge.getLength() / edge.getSpeed()
+        after_s += free_s(edge)
         onward = {other: for_motors(each) for other, each in edge.getOutgoing().items()}
         if after_m > REACH_M or any(each.getTLSID() for connections in onward.values() for each in connections):
             yield edge.getID(), [], after_s

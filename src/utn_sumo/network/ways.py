@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import dijkstra
 
-from utn_sumo.network.roads import TURNAROUND, for_motors
+from utn_sumo.network.roads import TURNAROUND, for_motors, free_s
 
 MINOR_S, TURNAROUND_S = 1.5, 5.0
 MINOR = frozenset("m=")
@@ -92,5 +92,5 @@ def _times(edges: list[Any], place: Mapping[str, int]) -> Any:
                 penalty_s += MINOR_S if all(each.getState() in MINOR for each in able) else 0.0
                 rows.append(number)
                 columns.append(place[ahead.getID()])
-                times_s.append(ahead.getLength() / ahead.getSpeed() + penalty_s)
+                times_s.append(free_s(ahead) + penalty_s)
     return sp.csr_array((np.array(times_s), (rows, columns)), shape=(len(edges), len(edges)))

@@ -72,8 +72,8 @@ def run(
             libsumo.simulationStep(now_s)
             spent_s += time.perf_counter() - started
             halting = [libsumo.edge.getLastStepHaltingNumber(road) for road in roads]
-            queue_veh = max(queue_veh, *halting)
-            vehicles_veh = max(vehicles_veh, *map(libsumo.edge.getLastStepVehicleNumber, roads))
+            queue_veh = max([queue_veh, *halting])
+            vehicles_veh = max([vehicles_veh, *map(libsumo.edge.getLastStepVehicleNumber, roads)])
             on_road = libsumo.vehicle.getIDCount()
             present_veh_s += LOOK_S * (on_road + len(libsumo.simulation.getPendingVehicles()))
             on_look(Look(now_s, sum(halting), present_veh_s / 3600))
