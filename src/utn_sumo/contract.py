@@ -70,6 +70,8 @@ class Link:
     """Those over which it leaves amid it."""
     parting_m: tuple[float, ...] = ()
     """How far before the stop line each of those begins."""
+    waiting: tuple[tuple[str, float], ...] = ()
+    """SUMO lanes, and their lengths [m], inside the node before a last edge that is too short to stand on."""
     begins_amid: bool = False
     """Whether it begins amid the net without another link that leads to it: nobody sees who waits behind its queue."""
     entry_flow_veh_s: float = np.inf

@@ -18,7 +18,17 @@ from utn_sumo.errors import NetworkError, did_you_mean
 from utn_sumo.network import programmes
 from utn_sumo.network.lanes import lane_groups, lane_sets
 from utn_sumo.network.programmes import MIN_GREEN_S, SHORT_GREEN_S, Block, Phase
-from utn_sumo.network.roads import Chain, Roads, for_motors, free_s, leads_on, motor_lanes, reserved_lanes, usual_weight
+from utn_sumo.network.roads import (
+    Chain,
+    Roads,
+    for_motors,
+    free_s,
+    leads_on,
+    lengths_m,
+    motor_lanes,
+    reserved_lanes,
+    usual_weight,
+)
 from utn_sumo.network.sides import side_roads
 from utn_sumo.network.streams import Signal, crossings
 from utn_sumo.network.ways import Traffic, turned_veh
@@ -192,7 +202,8 @@ class _Reader:
     def network(self, path: Path, name: str, left_alone: Mapping[str, str]) -> Network:
         turns, groups, lanes_of = self._turns()
         fed = {turn.next_link for turn in turns}
-        links = tuple(self._link(chain, index in fed) for index, chain in enumerate(self.chains))
+        inside_m = lengths_m(path, {lane for chain in self.chains for lane in chain.waiting})
+        links = tuple(self._link(chain, index in fed, inside_m) for index, chain in enumerate(self.chains))
         turn_index = {(turn.link, turn.to_edge): index for index, turn in enumerate(turns)}
         stages: list[Stage] = []
         junctions: list[Junction] = []
@@ -239,7 +250,7 @@ class _Reader:
             side_roads=sides,
         )
 
-    def _link(self, chain: Chain, fed: bool) -> Link:
+    def _link(self, chain: Chain, fed: bool, inside_m: Mapping[str, float]) -> Link:
         edges = [self.net.getEdge(member) for member in chain.edges]
         lanes = [len(motor_lanes(edge)) for edge in edges]
         lane_m = sum(edge.getLength() * count for edge, count in zip(edges, lanes, strict=True))
@@ -260,6 +271,7 @@ class _Reader:
             joining=chain.joining,
             parting=chain.parting,
             parting_m=chain.parting_m,
+            waiting=tuple((lane, inside_m[lane]) for lane in chain.waiting),
         )
 
     def _turns(self) -> tuple[list[Turn], list[LaneGroup], list[tuple[int, ...]]]:

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+
+from utn_sumo.xml_files import opened
 
 MOTOR = (
     "passenger", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped", "emergency", "private",
@@ -17,6 +20,8 @@ MOTOR = (
 """SUMO's vehicle classes that a lane for motor vehicles has one of, at least."""
 TURNAROUND = "t"
 STRAIGHT = "s"
+STANDS_M = 1.0
+"""SUMO has vehicles stand so far before a stop line."""
 RARE_LANES = 0.05
 """What a turnaround, or a turn for buses alone, counts as where nothing says how many take it."""
 
@@ -47,6 +52,21 @@ def for_motors(connections: Iterable[Any]) -> list[Any]:
     return [each for each in connections if _admits_motors(each.getFromLane()) and _admits_motors(each.getToLane())]
 
 
+def lengths_m(path: Path, lanes: Collection[str]) -> dict[str, float]:
+    """Lengths of some lanes of a net file, by id, those inside nodes too, which sumolib leaves out here."""
+    from defusedxml import ElementTree  # noqa: PLC0415
+
+    found: dict[str, float] = {}
+    if lanes:
+        with opened(path) as file:
+            for _, element in ElementTree.iterparse(file, forbid_dtd=True):
+                if element.tag == "lane" and element.get("id") in lanes:
+                    found[element.get("id")] = float(element.get("length"))
+                if element.tag in ("junction", "connection", "edge", "tlLogic"):
+                    element.clear()
+    return found
+
+
 def leads_on(edge: Any) -> bool:
     """Whether the road that an edge (sumolib) is of comes from elsewhere in the net, and not from its end."""
     before = [other for other, each in edge.getIncoming().items() if for_motors(each)]
@@ -70,6 +90,8 @@ class Chain:
     parting: tuple[str, ...]
     parting_m: tuple[float, ...]
     """How far before the stop line each of those is."""
+    waiting: tuple[str, ...]
+    """Lanes inside the node before the last edge, if vehicles stand there because that is too short."""
 
 
 class Roads:
@@ -89,13 +111,21 @@ class Roads:
             if before is None or before.getID() in edges:
                 parting.sort()
                 lanes, places_m = tuple(lane for lane, _ in parting), tuple(place_m for _, place_m in parting)
-                return Chain(tuple(edges), tuple(sorted(joining)), lanes, places_m)
+                return Chain(tuple(edges), tuple(sorted(joining)), lanes, places_m, self._waiting(approach))
             onto = [c for other, each in edge.getIncoming().items() if other is not before for c in for_motors(each)]
             off = [c for other, each in before.getOutgoing().items() if other is not edge for c in for_motors(each)]
             joining += [each.getViaLaneID() for each in onto]
             to_line_m += edge.getLength()
             parting += [(each.getViaLaneID(), to_line_m) for each in off]
             edges.insert(0, before.getID())
+
+    def _waiting(self, approach: str) -> tuple[str, ...]:
+        edge = self._net.getEdge(approach)
+        if edge.getLength() > STANDS_M:
+            return ()
+        onto = (each for connections in edge.getIncoming().values() for each in for_motors(connections))
+        # Who stands amid a junction with signals is seen there.
+        return tuple(sorted(each.getViaLaneID() for each in onto if each.getViaLaneID() and not each.getTLSID()))
 
     def _main_before(self, edge: Any) -> Any | None:
         """The edge that the main road comes from, through a node without signals that can be watched; else None."""
