@@ -608,6 +608,19 @@ def offsets(folder: Path) -> Path:
     return case(folder, traffic("ABD"))
 
 
+def hardly_an_edge(folder: Path) -> Path:
+    """A last edge of 0.3 m, as OpenStreetMap's nets have them: whoever waits stands inside the node before it."""
+    streets = row("A", lanes=2).without("W-A")
+    streets.node("p", -20, 0)
+    streets.one_way("W", "p", lanes=2)
+    streets.one_way("p", "A", lanes=3, length=0.3)
+    streets.net(folder, NO_TURNAROUNDS)
+    # He comes while the others go, and they stop coming.
+    lone = '<trip id="lone" depart="60" from="W-p" to="A-E"/>'
+    others = [flow(f"from_{arm}", f"{arm}A-A", f"A-{to}A", period=2, end=80) for arm, to in ("ns", "sn")]
+    return case(folder, "".join([lone, *others]))
+
+
 def coordinated(folder: Path) -> Path:
     """Offsets as tlsCoordinator writes them: programmes without phases in an additional file."""
     net = row("AB").net(folder, NO_TURNAROUNDS)
@@ -1001,6 +1014,7 @@ CASES: tuple[Make, ...] = (
     phases_that_are_skipped,
     offsets,
     coordinated,
+    hardly_an_edge,
     fractions_of_seconds,
     fraction_in_the_cycle,
     right_on_red,

@@ -418,7 +418,13 @@ def test_zones_cover_what_the_detectors_see_and_nothing_twice(
     assert sum(map(len, zones.values())) == sum(
         len(names) for rows in (named.set_zone, named.upstream_zone) for zone in rows for names in zone
     )
-    assert zones.keys() == areas.keys()
+    # Inside a node the zone sees a vehicle sooner than the area, which the edge before it ends with.
+    inside = {lane for lane in zones if lane.startswith(":")}
+    assert zones.keys() - inside == areas.keys() - inside
+    assert areas.keys() <= zones.keys()
+    for lane in inside:
+        assert zones.pop(lane) == [(0.0, -0.01)]
+        assert areas.pop(lane, [(CAR_M, -0.01)]) == [(CAR_M, -0.01)]
     for lane, ((begin_m, end_m),) in areas.items():
         pieces = sorted(zones[lane])
         assert pieces[0][0] == pytest.approx(begin_m, abs=0.01)
@@ -475,3 +481,16 @@ def test_who_stands_on_side_roads_is_seen_and_who_leaves_them_is_counted_on_over
     assert true.max() > 0
     assert (stand >= true - 1).all()
     assert (stand[true > 0] > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("controller", ["recommended", "max_wave", "max_pressure", "priced"])
+def test_who_waits_alone_inside_the_node_before_a_last_edge_of_no_length_is_let_go(
+    controller: str, tmp_path: Path
+) -> None:
+    file = odd_nets.hardly_an_edge(tmp_path)
+    result = bridge.run(scenario(net=str(file), controller=controller), tmp_path / "run")
+    assert (result["arrived"], result["unfinished"]) == (81, 0)
+    (lone,) = (trip for trip in ET.parse(tmp_path / "run" / "trips.xml").iter("tripinfo") if trip.get("id") == "lone")
+    waited_s = float(lone.attrib["waitingTime"])
+    assert waited_s < 40
+    assert abs(result["longest_red_s"] - waited_s) <= 5
