@@ -116,8 +116,8 @@ def ids(network: Network) -> DetectorIds:
             for zone in range(len(ZONES_M))
         )
 
-    def waiting(kind: str, link: Link) -> tuple[str, ...]:
-        return tuple(_named(kind, lane) for lane, _ in _waiting(kind, link))
+    def waiting(kind: str, index: int) -> tuple[str, ...]:
+        return tuple(_named(kind, lane) for lane, _ in _waiting(network, kind, index))
 
     def before(link: Link) -> Callable[[str], Sequence[int]]:
         return lambda edge: () if edge == link.edges[-1] else network.edge_lanes[edge]
@@ -133,8 +133,8 @@ def ids(network: Network) -> DetectorIds:
         stop_line=tuple(on("stop", link.edges[-1]) for link in network.links),
         turn=tuple(tuple(_named("turn", lane) for lane in turn.via_lanes) for turn in network.turns),
         area=tuple(
-            (*(name for edge, _ in network.watched(link) for name in on("area", edge)), *waiting("area", link))
-            for link in network.links
+            (*(name for edge, _ in network.watched(link) for name in on("area", edge)), *waiting("area", index))
+            for index, link in enumerate(network.links)
         ),
         group=tuple(at_line("area", group.link, group.lanes) for group in groups),
         set_area=tuple(at_line("area", link, lane_set.lanes) for link, lane_set in sets),
@@ -143,16 +143,16 @@ def ids(network: Network) -> DetectorIds:
         upstream=tuple(
             (
                 *(name for edge, _ in network.watched(link) if edge != link.edges[-1] for name in on("area", edge)),
-                *waiting("area", link),
+                *waiting("area", index),
             )
-            for link in network.links
+            for index, link in enumerate(network.links)
         ),
         joining=tuple(tuple(_named("side", lane) for lane in link.joining) for link in network.links),
         parting=tuple(tuple(_named("side", lane) for lane in link.parting) for link in network.links),
         set_zone=tuple(in_zones(link, of_set(link, lane_set)) for link, lane_set in sets),
         upstream_zone=tuple(
-            ((*zones[0], *waiting("zone0", link)), *zones[1:])
-            for link, zones in ((link, in_zones(index, before(link))) for index, link in enumerate(network.links))
+            ((*zones[0], *waiting("zone0", index)), *zones[1:])
+            for index, zones in enumerate(in_zones(index, before(link)) for index, link in enumerate(network.links))
         ),
         amid=tuple(tuple(_named("amid", lane) for lane in lanes) for lanes in _amid(network)),
         calling=tuple(tuple(_named("call", lane) for lane in caller.lanes) for _, caller in network.callers),
@@ -203,13 +203,16 @@ def _zones(network: Network, link: Link) -> list[tuple[str, int, float, float]]:
     return pieces
 
 
-def _waiting(kind: str, link: Link) -> list[tuple[str, float]]:
-    """(lane, metres from its begin) of detectors where vehicles wait inside the node before the last edge.
+def _waiting(network: Network, kind: str, link: int) -> list[tuple[str, float]]:
+    """(lane, metres from its begin) of detectors where vehicles wait inside the node before a link's last edge.
 
-    Of the whole area that of vehicles whose back has come off the edge before, where they are counted until then.
+    Of the whole area that of vehicles whose back has come off the edge before, where they are counted until then. Zones
+    have none on roads within a junction: who waits there is let out as such.
     """
     from_m = CAR_M if kind == "area" else 0.0
-    return [(lane, from_m) for lane, length_m in link.waiting if length_m >= from_m + LEAST_M]
+    if kind == "zone0" and network.within[link]:
+        return []
+    return [(lane, from_m) for lane, length_m in network.links[link].waiting if length_m >= from_m + LEAST_M]
 
 
 def _loops(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, float]]:
@@ -230,7 +233,7 @@ def _loops(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, f
 def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, float, float]]:
     """(kind, lane, metres from its begin, to) of the lane-area detectors."""
     length_m = network.edge_length_m
-    for link in network.links:
+    for index, link in enumerate(network.links):
         pieces = [("area", edge, length_m[edge] - seen_m, length_m[edge]) for edge, seen_m in network.watched(link)]
         for edge, zone, from_m, to_m in _zones(network, link) if within_step else ():
             # Less of a zone than that on an edge begins before the zone does.
@@ -243,7 +246,7 @@ def _areas(network: Network, *, within_step: bool) -> Iterator[tuple[str, str, f
             for lane in network.edge_lanes[edge]:
                 yield kind, f"{edge}_{lane}", from_m, to_m
         nearest = ("area", "zone0") if within_step else ("area",)
-        yield from ((kind, *place, NEARLY_M) for kind in nearest for place in _waiting(kind, link))
+        yield from ((kind, *place, NEARLY_M) for kind in nearest for place in _waiting(network, kind, index))
     for via in (via for lanes in _amid(network) for via in lanes if within_step):
         yield "amid", via, 0.0, NEARLY_M
     for own in sorted({own for _, caller in network.callers for own in caller.lanes}) if within_step else ():
