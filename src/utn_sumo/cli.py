@@ -115,9 +115,9 @@ def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: s
     demands = numbers("demand", demand or ("1.0" if own else "0.6,1.0,1.3"))
     seeds = campaign.seeds(f"1-{_whole('seeds', flags['seeds'])}")
     horizon, step_s = _whole("horizon", flags["horizon"]), _step_s(flags)
-    folder = recording.new_folder(out, f"mismatch-{Path(base['net']).name.partition('.')[0]}-{flags['controller']}")
+    name = f"mismatch-{Path(base['net']).name.partition('.')[0]}-{flags['controller']}"
     total = len(demands) * (len(seeds) + with_floor)
-    with report.counter("runs and replays", total) as tick:
+    with recording.results_in(out, name) as folder, report.counter("runs and replays", total) as tick:
         results = study.study_mismatch(
             base,
             demands,
@@ -185,8 +185,8 @@ def calibrate(out: Path, demand: str | None, seeds: str, **flags: Any) -> None:
     demands = numbers("demand", demand or ("0.7,0.9,1.1,1.25" if flags["case"] is None else "1.0"))
     seed_list = campaign.seeds(seeds)
     base = _base(flags) | {"calibration": "none"}
-    folder = recording.new_folder(out, "calibration")
-    with report.counter("runs", len(demands) * len(seed_list)) as tick:
+    total = len(demands) * len(seed_list)
+    with recording.results_in(out, "calibration") as folder, report.counter("runs", total) as tick:
         content = study.study_calibration(base, demands, seed_list, folder, step_s=_step_s(flags), tick=tick)
     path = folder / "calibration.json"
     recording.write_json(path, content)

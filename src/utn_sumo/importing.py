@@ -79,6 +79,7 @@ def write(found: Import, folder: Path) -> dict[str, Any]:
         "by_class_veh": dict(traffic.by_class_veh),
         "space_m": traffic.space_m,
         "without_route_veh": traffic.without_route_veh,
+        "without_ends_veh": traffic.without_ends_veh,
         "turns": str(turns),
         "calibration": str(fitted) if fitted.is_file() else None,
         "files": {str(original): name for original, name in copies.names.items()},

@@ -19,7 +19,8 @@ import json
 import math
 import platform
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from types import NoneType
@@ -33,6 +34,19 @@ from utn_sumo.errors import ResultError
 
 SETTINGS, CYCLES, RESULT = "settings.json", "cycles.jsonl", "result.json"
 NET, ROUTES, PROGRAMMES = "net.net.xml", "routes.rou.xml", "programmes.add.xml"
+
+
+@contextmanager
+def results_in(path: Path | None, default_name: str) -> Iterator[Path]:
+    """A `new_folder`, which is gone again if an error ends what is done with it before anything is in it."""
+    is_new = path is None or not path.exists()
+    folder = new_folder(path, default_name)
+    try:
+        yield folder
+    except BaseException:
+        if is_new and not any(folder.iterdir()):
+            folder.rmdir()
+        raise
 
 
 def new_folder(path: Path | None, default_name: str, flag: str = "--out") -> Path:

@@ -85,4 +85,4 @@ def test_mismatch_and_calibrate_work_from_the_command_line(tmp_path: Path) -> No
 def test_a_mistake_of_a_study_names_the_setting(tmp_path: Path, options: list[str], complaint: str) -> None:
     done = CliRunner().invoke(cli, ["mismatch", "--hours", "0.4", *options, "--out", str(tmp_path / "out")])
     assert complaint in str(done.exception)
-    assert not (tmp_path / "out" / "runs").exists()
+    assert not (tmp_path / "out").exists()

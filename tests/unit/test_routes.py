@@ -152,11 +152,18 @@ def test_those_whose_way_sumo_finds_are_counted_apart(tmp_path: Path) -> None:
         '<trip id="t" depart="1" from="a" via="b" to="c"/><flow id="f" number="9" from="a" to="d"/>'
         f'<vehicle id="v" depart="1">{OWN}</vehicle><person id="p" depart="1"/>',
     )
-    assert found.without_route_veh == 10
+    assert (found.without_route_veh, found.without_ends_veh) == (10, 0)
     assert sum(found.by_class_veh.values()) == 11
     assert found.turned_veh == {("a", "b"): 1, ("b", "c"): 1}
     assert set(found.named_by) == {"a", "b", "c", "d"}
     assert found.named_by["d"].startswith("flow 'f' of ")
+
+
+def test_trips_between_districts_are_told_apart(tmp_path: Path) -> None:
+    found = traffic(
+        tmp_path, '<flow id="f" number="9" fromTaz="a" toTaz="d"/><trip id="t" depart="1" from="a" to="b"/>'
+    )
+    assert (found.without_route_veh, found.without_ends_veh) == (10, 9)
 
 
 def test_who_stops_on_the_way_is_sent_by_there(tmp_path: Path) -> None:

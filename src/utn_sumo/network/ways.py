@@ -53,6 +53,11 @@ class Traffic:
         """Vehicles whose way SUMO finds itself."""
         return sum(self.trips_veh.values())
 
+    @property
+    def without_ends_veh(self) -> float:
+        """Those among them of whom nobody knows the edges either that they begin and end on."""
+        return sum(veh for passed, veh in self.trips_veh.items() if len(passed) < 2)  # noqa: PLR2004 - a way's ends
+
 
 def turned_veh(net: Any, trips_veh: Mapping[tuple[str, ...], float]) -> dict[tuple[str, str], float]:
     """Vehicles by (edge, next edge) on the fastest ways of trips, given as (from, via ..., to) and how many there are.
