@@ -13,7 +13,7 @@ run: .venv/.core
 test: lint
 	$(BIN)/python -m pytest -n logical --dist worksteal
 
-# The tests that take minutes each: 4 h runs, 2 h comparisons, the wheel.
+# The tests that take ten seconds to minutes each: long runs, comparisons, the wheel.
 test-long: .venv/.dev
 	$(BIN)/python -m pytest -m long -n logical --dist worksteal
 

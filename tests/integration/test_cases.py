@@ -287,6 +287,7 @@ def test_left_turns_that_meet_are_controlled_and_one_of_them_gives_way(tmp_path:
 CLASH = [(60, "GGGGGG"), (3, "yyyyyy"), (50, "rrrGGG"), (7, "rrryyy")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stopped_after", [None, 4], ids=["whole", "stopped early"])
 @pytest.mark.parametrize("controller", ["native", "fixed", "actuated"])
 def test_bare_sumo_replays_its_runs_vehicle_for_vehicle(

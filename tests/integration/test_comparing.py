@@ -26,6 +26,7 @@ class Dies:
 """
 
 
+@pytest.mark.long
 def test_a_controller_that_breaks_leaves_the_others_alone_and_is_tried_again(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text(BROKEN, encoding="utf-8")
     names = [f"{tmp_path / 'broken.py'}:Dies", "fixed", f"{tmp_path / 'broken.py'}:Raises"]

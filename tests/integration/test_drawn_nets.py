@@ -19,6 +19,7 @@ def routes(config: str) -> bytes:
     return text[text.index(b"<vehicle") :]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("tool", [drawn_nets, drawn_towns], ids=["nets", "towns"])
 def test_a_seed_draws_the_same_and_another_one_others(tool: ModuleType, tmp_path: Path) -> None:
     def drawn(seed: int, name: str) -> list[bytes]:

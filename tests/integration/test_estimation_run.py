@@ -167,12 +167,14 @@ CROWD = {"controller": "fixed", "hours": 0.5, "demand": 1.5, "profile": "constan
 """Traffic that changes lanes while it stands on the entry loops."""
 
 
+@pytest.mark.long
 def test_nobody_enters_backwards(run_of: RunOf) -> None:
     entered = np.array([cycle["seen"]["entered_veh"] for cycle in records(run_of(**CROWD)[1])])
     assert entered.sum() > 1000
     assert entered.min() >= 0
 
 
+@pytest.mark.long
 def test_a_crowd_on_miscounting_loops_does_not_bring_the_run_down(run_of: RunOf) -> None:
     result, folder = run_of(**CROWD, loop_error=LOOP_ERROR)
     assert result["hours"] == CROWD["hours"]

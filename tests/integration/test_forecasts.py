@@ -33,6 +33,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return folders
 
 
+@pytest.mark.long
 def test_who_served_is_on_record(runs: list[Path]) -> None:
     served = [set(cycle["forecast"]["served"]) - {""} for cycle in cycles(runs[0])]
     assert all(methods == {"profile"} for methods in served[:SERVING])
@@ -46,6 +47,7 @@ def test_a_run_foretells_alike_when_it_is_run_again(runs: list[Path], tmp_path: 
     assert first == again
 
 
+@pytest.mark.long
 def test_the_report_judges_every_method_at_every_step(runs: list[Path], tmp_path: Path) -> None:
     arguments = ["forecast-report", *map(str, runs), "--horizon", "3", "--out", str(tmp_path / "out"), "--json"]
     answer = CliRunner().invoke(cli, arguments, catch_exceptions=False)
@@ -62,6 +64,7 @@ def test_the_report_judges_every_method_at_every_step(runs: list[Path], tmp_path
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"forecasts.json", "forecasts.png"}
 
 
+@pytest.mark.long
 def test_too_short_a_run_is_not_judged(tmp_path: Path) -> None:
     folders = []
     for seed in (1, 2):

@@ -64,6 +64,7 @@ def test_they_are_registered_with_their_settings() -> None:
     assert "max_gap_s" in controllers.settings_of(PEERS["actuated"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("controller", PEERS)
 def test_trips_are_those_of_the_bare_sumo_with_the_same_additional_file(
     town: Path, tmp_path: Path, controller: str

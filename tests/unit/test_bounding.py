@@ -45,6 +45,7 @@ def test_it_is_nothing_in_light_traffic_and_grows_with_demand_and_time_lost(utn1
     assert 0 < bound(utn17, 1100, 0.05) < bound(utn17, 1300, 0.05) < bound(utn17, 1300, 0.15)
 
 
+@pytest.mark.long
 def test_a_run_has_more_delay(utn17: Network, tmp_path: Path) -> None:
     chosen = scenario(profile="constant", demand=1.5, hours=0.5)
     result = bridge.run(chosen, tmp_path / "run")

@@ -146,6 +146,7 @@ def by_active_sets(whole: WholeProblem, stated: Sequence[QuadraticProgram]) -> f
     return float(least + sum(program.constant for program in stated))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ["almost empty", *HARD])
 def test_another_solver_finds_the_same_least_cost(stubby: Network, cost: str, case: str) -> None:
     convex = planner(CentralizedMPC(stubby, cost=cost))

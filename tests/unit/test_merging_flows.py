@@ -96,6 +96,7 @@ def test_many_iterations_reach_the_optimum_of_the_whole_problem(merging: Network
     assert -1e-6 <= gap(merging, patient, *some(merging, 7)) <= 2e-5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_so_are_those_of_agents_that_are_solved_side_by_side(merging_grid: Network, cost: str, seed: int) -> None:
     mpc = DistributedMPC(merging_grid, cost=cost)

@@ -69,6 +69,7 @@ def test_every_variant_is_one_that_the_registered_controllers_take(utn17_long: N
         assert controller.horizon == 7
 
 
+@pytest.mark.long
 def test_the_command_prints_the_papers_table_beside_ours_and_draws_the_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -62,6 +62,7 @@ def rmse(method: str, counts: Floats, profile: Floats, **chosen: Any) -> float:
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
+@pytest.mark.long
 def test_what_neighbours_tell_is_worth_something_and_so_is_the_own_past() -> None:
     errors = {
         method: np.mean([rmse(method, *correlated(130, 6, seed)) for seed in range(2)])
