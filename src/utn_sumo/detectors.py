@@ -152,7 +152,8 @@ def ids(network: Network) -> DetectorIds:
         set_zone=tuple(in_zones(link, of_set(link, lane_set)) for link, lane_set in sets),
         upstream_zone=tuple(
             ((*zones[0], *waiting("zone0", index)), *zones[1:])
-            for index, zones in enumerate(in_zones(index, before(link)) for index, link in enumerate(network.links))
+            for index, link in enumerate(network.links)
+            for zones in [in_zones(index, before(link))]
         ),
         amid=tuple(tuple(_named("amid", lane) for lane in lanes) for lanes in _amid(network)),
         calling=tuple(tuple(_named("call", lane) for lane in caller.lanes) for _, caller in network.callers),

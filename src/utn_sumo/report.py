@@ -145,8 +145,10 @@ def import_table(result: dict[str, Any]) -> None:
     """What has been imported, and how to run it."""
     console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
     without_veh, nowhere_veh = result["without_route_veh"], result["without_ends_veh"]
-    fastest = f"{without_veh - nowhere_veh:.0f}: taken to go the fastest way on empty roads"
-    nowhere = f"{nowhere_veh:.0f}: left out of the turning fractions, as their ends are no edges" if nowhere_veh else ""
+    without = {
+        "taken to go the fastest way on empty roads": without_veh - nowhere_veh,
+        "left out of the turning fractions, as their ends are no edges": nowhere_veh,
+    }
     rows = {
         "window": _window(result),
         "at its begin": "the roads are empty: they have to fill first" if result["empty_at_begin"] else "a saved state",
@@ -155,7 +157,7 @@ def import_table(result: dict[str, Any]) -> None:
         "links, stages": f"{result['links']}, {result['stages']}; a plan every {result['control_step_s']:g} s",
         "vehicles": ", ".join(f"{veh:.0f} {vclass}" for vclass, veh in result["by_class_veh"].items()) or "none",
         "room of a vehicle": f"{result['space_m']:.2f} m with its gap",
-        "without a route": "; ".join(filter(None, (fastest, nowhere))) if without_veh else "none",
+        "without a route": "; ".join(f"{veh:.0f}: {how}" for how, veh in without.items() if veh) or "none",
         "turning fractions": f"in {Path(result['turns']).name}",
         "calibration": Path(result["calibration"]).name if result["calibration"] else "none: utn import --calibrate",
     }
