@@ -1,17 +1,18 @@
 """From any stage to any other: the yellow and the red between them, by the times that the net itself keeps.
 
 To the stage that follows in the net's own programme it is the net's own clearance, to the second. To another one it is
-made: who loses green has the yellow that the net gives it, who gains green waits as long after each conflicting stream
-as the net has them wait, or the longest that the junction has after one of its kind, who walks or who drives, where the
-net never shows the two in turn. Where those who walk need longer than all others, these keep their green meanwhile, as
-the net has cars drive on while people are cleared.
+made: who loses green has the yellow that the net gives it; who gains green, or way over others, waits as long after
+each conflicting stream as the net has them wait. Where the net never shows the two in turn he waits the longest that
+the junction has those who open together wait for the last driver before them, or that it has the next stage wait after
+who walks. Where those who walk need longer than all others, these keep their green meanwhile, as the net has cars drive
+on while people are cleared.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -32,9 +33,11 @@ class Times:
     yellow_s: Floats
     """(letters,) after each signal's green."""
     between_s: Floats
-    """(letters, letters) from the end of one's green to the begin of another's."""
+    """(letters, letters) from the end of one's green to the begin of another's, or to when that one need give way no
+    more, if the yellow of the first is over by then."""
     longest_s: Floats
-    """(letters,) the longest from the end of a green, of who walks or of others as each is, to the stage after it."""
+    """(letters,) of who drives the longest that those who open together wait, amid a change of stages, for the last one
+    who conflicts; of who walks the longest from the end of his green to the stage after it."""
 
     @classmethod
     def of(cls, network: Network, junction: Junction) -> Times:
@@ -47,34 +50,50 @@ class Times:
         letters, seconds = len(shown[0]), len(shown)
         green = np.array([[letter in GREEN for letter in state] for state in shown])
         yellow = np.array([[letter in YELLOW for letter in state] for state in shown])
-        ends = [np.flatnonzero(green[:, a] & ~np.roll(green[:, a], -1)) for a in range(letters)]
-        begins = [np.flatnonzero(green[:, a] & ~np.roll(green[:, a], 1)) for a in range(letters)]
+        changes = zip([shown[-1], *shown[:-1]], shown, strict=True)
+        gains = np.array([[_gains(*pair) for pair in zip(*states, strict=True)] for states in changes])
         yellow_s = np.full(letters, np.nan)
         between_s = np.full((letters, letters), np.nan)
         for a in range(letters):
-            for end in ends[a]:
+            for end in np.flatnonzero(green[:, a] & ~np.roll(green[:, a], -1)):
                 after = np.roll(yellow[:, a], -end - 1)
-                yellow_s[a] = np.fmax(yellow_s[a], seconds if after.all() else int(np.argmin(after)))
-            for b in range(letters):
-                gaps = [(begin - end - 1) % seconds for end in ends[a] for begin in begins[b]]
-                if gaps:
-                    between_s[a, b] = min(gaps)
+                own_s = seconds if after.all() else int(np.argmin(after))
+                yellow_s[a] = np.fmax(yellow_s[a], own_s)
+                # Who gets green while another is being cleared gives way to him.
+                gains_s = np.where(np.roll(gains, -end - 1, axis=0)[own_s:].T, np.arange(own_s, seconds), np.inf)
+                between_s[a] = np.fmin(between_s[a], gains_s.min(axis=1, initial=np.inf))
+        between_s[np.isinf(between_s)] = np.nan
         usual = np.nanmax(yellow_s) if np.isfinite(yellow_s).any() else USUAL_YELLOW_S
         return cls(np.where(np.isnan(yellow_s), usual, yellow_s), between_s, _longest(network, junction, letters))
 
 
+def _gains(was: str, becomes: str) -> bool:
+    """Whether a signal gets green, or need not give way any more."""
+    return (becomes in GREEN and was not in GREEN) or (becomes == HAS_WAY != was)
+
+
 def _longest(network: Network, junction: Junction, letters: int) -> Floats:
-    """`Times.longest_s`."""
-    own_s = np.zeros(letters)
+    """`Times.longest_s`. Drivers are cleared alike, people as wide as the road is: of them nothing less is known."""
+    walks = np.isin(np.arange(letters), junction.crossings)
+    waits_s, rests_s = [], {True: [0], False: [0]}
     for index in junction.stages:
         stage, then = network.stages[index], network.stages[following(junction, index)]
-        states = [stage.state, *(state for state, seconds in stage.clearance for _ in range(round(seconds)))]
-        for a in range(letters):
+        cleared = [state for state, seconds in stage.clearance for _ in range(round(seconds))]
+        ended: dict[int, int] = {}
+        for second, (was, becomes) in enumerate(pairwise([stage.state, *cleared, then.state])):
+            ended |= {a: second for a in range(letters) if was[a] in GREEN and becomes[a] not in GREEN}
+            opening = [b for b in range(letters) if _gains(was[b], becomes[b])]
+            cleared_s = [
+                second - since
+                for a, since in ended.items()
+                if not walks[a] and becomes[a] not in GREEN + YELLOW and any(junction.conflicts[a][b] for b in opening)
+            ]
+            if cleared_s:
+                waits_s.append(min(cleared_s))
+        for a, second in ended.items():
             if stage.state[a] in GREEN and then.state[a] not in GREEN:
-                last = max(second for second, state in enumerate(states) if state[a] in GREEN)
-                own_s[a] = max(own_s[a], len(states) - 1 - last)
-    walks = np.isin(np.arange(letters), junction.crossings)
-    return np.asarray(np.where(walks, own_s[walks].max(initial=0.0), own_s[~walks].max(initial=0.0)))
+                rests_s[bool(walks[a])].append(len(cleared) - second)
+    return np.where(walks, max(rests_s[True]), max(waits_s or rests_s[False])).astype(float)
 
 
 def following(junction: Junction, stage: int) -> int:
@@ -89,7 +108,7 @@ def between(network: Network, junction: Junction, times: Times, first: int, then
         return network.stages[first].clearance
     was, becomes = network.stages[first].state, network.stages[then].state
     closing = [a for a, letter in enumerate(was) if letter in GREEN and becomes[a] not in GREEN]
-    opening = [b for b, letter in enumerate(becomes) if letter in GREEN and was[b] not in GREEN]
+    opening = [b for b, letter in enumerate(becomes) if _gains(was[b], letter)]
     needed_s = {True: 0, False: 0}
     for a in closing:
         # Known gaps are of streams that follow each other; longer ones have other stages in between.

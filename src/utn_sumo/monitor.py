@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from utn_sumo.contract import Junction, Network
+from utn_sumo.contract import Junction, Network, Stage
 from utn_sumo.errors import ResultError
 
 LETTERS = frozenset("GgyYrsu")
@@ -109,7 +109,7 @@ class _Rules:
     yellow_s: list[float]
     """Least yellow after it."""
     between_s: list[list[float]]
-    """Least time from the end of one signal's green to the begin of another's."""
+    """Least time from the end of one signal's green to the begin of another's, or of the time when it has way."""
 
     @classmethod
     def of(cls, network: Network, junction: Junction, *, executed: bool = False) -> _Rules:
@@ -130,9 +130,6 @@ class _Rules:
         for state, seconds in 3 * phases:
             seen = now_s >= cycle_s
             for signal, (was, now) in enumerate(zip(before, state, strict=True)):
-                if seen and now in GREEN and was not in GREEN:
-                    for foe in range(size):
-                        between[foe][signal] = min(between[foe][signal], now_s - ended[foe])
                 if was in GREEN and now not in GREEN:
                     ended[signal] = now_s
                     if seen:
@@ -141,6 +138,12 @@ class _Rules:
                     yellow[signal] = min(yellow[signal], amber[signal])
                 lit[signal] = (lit[signal] if was in GREEN else 0.0) + seconds if now in GREEN else 0.0
                 amber[signal] = (amber[signal] if was in YELLOW else 0.0) + seconds if now in YELLOW else 0.0
+            # Who gets green beside a yellow gives way to whom it clears.
+            red = [foe for foe in range(size) if state[foe] not in GREEN + YELLOW]
+            for signal in range(size):
+                if seen and _opens(before[signal], state[signal]):
+                    for foe in red:
+                        between[foe][signal] = min(between[foe][signal], now_s - ended[foe])
             now_s, before = now_s + seconds, state
         # What the programme never shows it asks nothing of.
         shown = [[0.0 if math.isinf(least_s) else least_s for least_s in row] for row in (green, yellow, *between)]
@@ -150,7 +153,8 @@ class _Rules:
     def in_any_order(cls, network: Network, junction: Junction) -> _Rules:
         """The same for stages in any order: what the programme has beyond one stage, or one clearance, need not be.
 
-        Not longer after a driver's green than it has the next stage wait after one, nor after a walker's.
+        Not longer after a walker's green than it has the next stage wait after one. Nor after a driver's than it has
+        those who open together wait for the last driver before them.
         """
         own = cls.of(network, junction, executed=True)
         stages = [network.stages[index] for index in junction.stages]
@@ -158,20 +162,39 @@ class _Rules:
             min([least_s, *(stage.least_green_s for stage in stages if stage.state[signal] in GREEN)])
             for signal, least_s in enumerate(own.green_s)
         ]
-        longest_s = {True: 0.0, False: 0.0}
-        for stage, then in zip(stages, [*stages[1:], stages[0]], strict=True):
-            for signal, (was, becomes) in enumerate(zip(stage.state, then.state, strict=True)):
-                if was in GREEN and becomes not in GREEN:
-                    rest = 0.0
-                    for state, seconds in stage.clearance:
-                        rest = 0.0 if state[signal] in GREEN else rest + seconds
-                    walks = signal in junction.crossings
-                    longest_s[walks] = max(longest_s[walks], rest)
+        longest_s = _longest_s(junction, stages)
         between = [
             [min(least_s, longest_s[signal in junction.crossings]) for least_s in row]
             for signal, row in enumerate(own.between_s)
         ]
         return cls(green, own.yellow_s, between)
+
+
+def _longest_s(junction: Junction, stages: list[Stage]) -> dict[bool, float]:
+    """The longest wait after a green of who walks (True) or drives (False) amid a change of stages."""
+    rests_s: dict[bool, list[float]] = {True: [0.0], False: [0.0]}
+    waits_s = []
+    for stage, then in zip(stages, [*stages[1:], stages[0]], strict=True):
+        ended_s = [0.0 if letter in GREEN else math.inf for letter in stage.state]
+        for (state, seconds), (next_state, _) in pairwise([(stage.state, 0.0), *stage.clearance, (then.state, 0.0)]):
+            ended_s = [0.0 if letter in GREEN else s + seconds for letter, s in zip(state, ended_s, strict=True)]
+            foes = {
+                foe
+                for signal, letters in enumerate(zip(state, next_state, strict=True))
+                for foe, conflicts in enumerate(junction.conflicts[signal])
+                if conflicts and _opens(*letters) and next_state[foe] not in GREEN + YELLOW
+            }
+            wait_s = min((ended_s[foe] for foe in foes.difference(junction.crossings)), default=math.inf)
+            waits_s += [wait_s] if wait_s < math.inf else []
+        for signal, (was, becomes) in enumerate(zip(stage.state, then.state, strict=True)):
+            if was in GREEN and becomes not in GREEN:
+                rests_s[signal in junction.crossings].append(ended_s[signal])
+    return {True: max(rests_s[True]), False: max(waits_s or rests_s[False])}
+
+
+def _opens(was: str, now: str) -> bool:
+    """Whether a signal turns green, or gets the way over others that it had not."""
+    return (now in GREEN and was not in GREEN) or now == "G" != was
 
 
 class _Guard:
@@ -226,10 +249,11 @@ class _Guard:
         if now in GREEN and was not in GREEN:
             lasts = self.under_way or self.ends[signal] in GREEN
             self.green_since_s[signal] = LONG_AGO_S if now_s == 0 and lasts else now_s
+        if now == "G" != was:
             for foe in self.foes[signal]:
                 between_s = now_s - self.green_until_s[foe]
-                if now == "G" and stretch.state[foe] not in GREEN and _less(between_s, rules.between_s[foe][signal]):
-                    return f"turns green too soon after signal {foe}"
+                if stretch.state[foe] not in GREEN and _less(between_s, rules.between_s[foe][signal]):
+                    return f"has way too soon after signal {foe}"
         elif was in GREEN and now not in GREEN:
             self.yellow_since_s[signal] = now_s
             if now == "r" and signal not in self.junction.without_yellow:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
@@ -10,10 +11,13 @@ import numpy as np
 import pytest
 
 from tests.integration import odd_nets
+from tests.integration.odd_nets import DARK, NO_TURNAROUNDS, retime, row, tl_logic
 from utn_sumo import clearances, monitor, streets
 from utn_sumo.clearances import Times, between
 from utn_sumo.contract import Junction, Network
 from utn_sumo.plant.heads import Heads
+
+StreetOf = Callable[[Callable[[Path], Path]], Network]
 
 
 def ways(network: Network, junction: Junction) -> dict[tuple[int, int], clearances.Phases]:
@@ -67,8 +71,13 @@ def recorded(network: Network, folder: Path, seed: int) -> Path:
     """SUMO's record of that, of many changes."""
     changes = shown_by(network, seed, 1200)
     assert len(changes) > 100
+    return written(folder, changes)
+
+
+def written(folder: Path, changes: Iterable[tuple[float, str, str]]) -> Path:
+    """(second, junction, letters) of every change, as SUMO records them."""
     lines = [
-        f'<tlsState time="{second}.00" id="{name}" programID="x" phase="0" state="{state}"/>'
+        f'<tlsState time="{second:.2f}" id="{name}" programID="x" phase="0" state="{state}"/>'
         for second, name, state in changes
     ]
     (folder / "signals.xml").write_text(f"<tlsStates>{''.join(lines)}</tlsStates>", encoding="utf-8")
@@ -131,8 +140,68 @@ def test_the_monitor_sees_a_second_too_few_for_who_walks_or_who_drives(
         for number, (state, seconds) in enumerate(
             [(walked.stages[first].state, 20.0), *made, (walked.stages[third].state, 20.0)]
         ):
-            shown.append(f'<tlsState time="{now_s:.2f}" id="{junction.id}" programID="x" phase="0" state="{state}"/>')
+            shown.append((now_s, junction.id, state))
             now_s += seconds - missing * (number == phase + 1)
-        (tmp_path / "signals.xml").write_text(f"<tlsStates>{''.join(shown)}</tlsStates>", encoding="utf-8")
-        verdict = monitor.watch(walked, tmp_path / "signals.xml", round(now_s), in_order=False)
+        verdict = monitor.watch(walked, written(tmp_path, shown), round(now_s), in_order=False)
         assert (len(verdict.reasons) > 0) == (missing > 0)
+
+
+def retimed(*phases: tuple[float, str]) -> Callable[[Path], Path]:
+    """A crossroads of single lanes with this programme; of an arm its letters are right turn, ahead, left turn."""
+    return lambda folder: retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", phases))
+
+
+LEFT_LAST = retimed(
+    *((25, "GGgrrrGGgrrr"), (3, "yygrrryygrrr"), (4, "rrGrrrrrGrrr"), (3, "rryrrrrryrrr"), (2, DARK)),
+    *((20, "rrrGGGrrrrrr"), (3, "rrryyyrrrrrr"), (2, DARK)),
+    *((20, "rrrrrrrrrGGG"), (3, "rrrrrrrrryyy"), (2, DARK)),
+)
+"""Left turns from north and south have way for 4 s when those ahead are cleared; the east and the west come in turn."""
+LEFT_GOES_ON = retimed(
+    *((25, "GGrrrrGGrrrr"), (3, "GGgrrryyyrrr"), (20, "GGGrrrrrrrrr"), (3, "yyyrrrrrrrrr"), (2, DARK)),
+    *((20, "rrrGGgrrrGGg"), (3, "rrryyyrrryyy"), (2, DARK)),
+)
+"""The north's left turns may go, giving way, as soon as the south is being cleared, and have way when it is."""
+
+
+def test_who_never_follows_another_waits_as_others_wait_for_the_last_before_them(street_of: StreetOf) -> None:
+    net = street_of(LEFT_LAST)
+    (junction,) = net.junctions
+    first, east, west = junction.stages
+    assert sum(seconds for _, seconds in net.stages[first].clearance) == 12
+    # In these 12 s the next ones wait for the left turns, that go until 5 before the end.
+    assert set(Times.of(net, junction).longest_s) == {5}
+    found = ways(net, junction)
+    for pair in ((first, west), (east, first), (west, east)):
+        assert [seconds for _, seconds in found[pair]] == [3, 2]
+
+
+def test_who_may_go_giving_way_while_another_is_cleared_has_way_when_he_is(street_of: StreetOf) -> None:
+    net = street_of(LEFT_GOES_ON)
+    (junction,) = net.junctions
+    times = Times.of(net, junction)
+    north_left, south, east = 2, 7, 4
+    assert times.between_s[south, north_left] == 3
+    assert times.between_s[south, east] == 3 + 10 + 3 + 2
+    assert set(times.longest_s) == {5}
+
+
+@pytest.mark.parametrize("make", [LEFT_LAST, LEFT_GOES_ON], ids=["left turns last", "left turns go on"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_monitor_has_nothing_to_say_where_clearances_are_staggered(
+    street_of: StreetOf, tmp_path: Path, make: Callable[[Path], Path], seed: int
+) -> None:
+    net = street_of(make)
+    assert monitor.watch(net, recorded(net, tmp_path, seed), 1200, in_order=False).reasons == []
+
+
+def test_the_monitor_sees_a_second_too_few_before_who_gets_way_and_had_a_green_that_gives_way(
+    street_of: StreetOf, tmp_path: Path
+) -> None:
+    net = street_of(LEFT_GOES_ON)
+    (junction,) = net.junctions
+    for yellow_s in (3, 2):
+        shown = [(0, "GGrrrrGGrrrr"), (20, "GGgrrryyyrrr"), (20 + yellow_s, "GGGrrrrrrrrr")]
+        record = written(tmp_path, [(second, junction.id, state) for second, state in shown])
+        verdict = monitor.watch(net, record, 40, in_order=False)
+        assert bool([reason for reason in verdict.reasons if "has way too soon" in reason]) == (yellow_s < 3)
