@@ -37,8 +37,10 @@ from utn_sumo import (
     replay,
     report,
     streets,
+    study,
     sumo_tools,
 )
+from utn_sumo.case import SUFFIX
 from utn_sumo.cli import numbers
 from utn_sumo.contract import Measurement, Network
 from utn_sumo.demand import mean_profile_veh_h
@@ -49,6 +51,8 @@ from utn_sumo.recording import Log
 from utn_sumo.scenario import Scenario, scenario
 
 COUNT = click.IntRange(1)
+AHEAD = 7
+"""Control steps ahead for which the model's errors are measured."""
 
 
 @click.group()
@@ -116,24 +120,27 @@ def overhead(controller: str, net: str, hours: float, demand: float, seed: int, 
 @click.option("--grids", default="one-way", show_default=True, help="Kinds: one-way, imported (half an hour).")
 @click.option("--steps", type=COUNT, default=14, show_default=True, help="Control steps on them.")
 @click.option("--hours", default=4.0, show_default=True, help="Of the run for the overhead.")
-@click.option("--plot", type=click.Path(path_type=Path), help="Draw gaps and time spent against the iterations here.")
+@click.option(
+    "--plot", type=click.Path(path_type=Path), help="New folder for solve.png: gaps and time spent against iterations."
+)
 @click.option("--json", "as_json", is_flag=True)
 def solve(only: str, sizes: str, grids: str, plot: Path | None, as_json: bool, **given: Any) -> None:
     """Centralized and distributed MPC: how near to the optimum, how fast, how large, how often without a plan."""
     large = [int(size) for size in _among("sizes", sizes, map(str, nets.SIZES))]
+    folder = None if plot is None else recording.new_folder(plot, "", "--plot")
     wanted = solving.Wanted(sizes=large, grids=_among("grids", grids, scaling.JUDGED), **given)
     found: dict[str, Any] = {}
     for part in _among("only", only, solving.PARTS):
         found |= solving.PARTS[part](wanted)
-    if plot is not None:
-        solving.draw(found, plot)
     if as_json:
         click.echo(json.dumps(found))
-        return
-    for name, rows in found.items():
-        if isinstance(rows, list):
-            _show(name, list(rows[0]), [[_text(value) for value in row.values()] for row in rows])
-    _show("figures", ["figure", "value"], [[k, _text(v)] for k, v in found.items() if not isinstance(v, list)])
+    else:
+        for name, rows in found.items():
+            if isinstance(rows, list):
+                _show(name, list(rows[0]), [[_text(value) for value in row.values()] for row in rows])
+        _show("figures", ["figure", "value"], [[k, _text(v)] for k, v in found.items() if not isinstance(v, list)])
+    if folder is not None:
+        solving.draw(found, folder / "solve.png")
 
 
 def _text(value: Any) -> str:
@@ -186,20 +193,20 @@ def traffic(nets: tuple[str, ...], controllers: str, plot: Path | None, as_json:
 @click.option("--json", "as_json", is_flag=True)
 def step(net: str, hours: float, demand: float, seeds: str, steps: str, as_json: bool) -> None:
     """Control by `dmpc` with each model step: time spent, time a plan, and the same step's error in open loop."""
+    _check_drawn(net)
     whole = network.load(net)
     known = calibration.for_model(whole, None)
     rows, seed_list = [], campaign.seeds(seeds)
     for step_s in numbers("steps", steps):
+        runs = [
+            scenario(net=net, hours=hours, demand=demand, seed=seed, settings={"step_s": step_s}) for seed in seed_list
+        ]
+        for each in runs:
+            study.check(each, AHEAD + 2)
         with tempfile.TemporaryDirectory() as temporary:
-            results = [
-                bridge.run(
-                    scenario(net=net, hours=hours, demand=demand, seed=seed, settings={"step_s": step_s}),
-                    Path(temporary) / str(seed),
-                )
-                for seed in seed_list
-            ]
+            results = [bridge.run(each, Path(temporary) / str(each.seed)) for each in runs]
             log = Log.stack([recording.read_log(Path(temporary) / str(seed)) for seed in seed_list])
-        found = mismatch.errors(known, log, step_s, 7)
+        found = mismatch.errors(known, log, step_s, AHEAD)
         ratio = mismatch.summary(known, found, None)["rmse_over_persistence"]
         spent = [result["total_time_spent_veh_h"] for result in results]
         plans = hours * 3600 / whole.control_step_s
@@ -242,6 +249,7 @@ def step(net: str, hours: float, demand: float, seeds: str, steps: str, as_json:
 @click.option("--json", "as_json", is_flag=True)
 def estimate(net: str, hours: float, demands: str, errors: str, seed: int, as_json: bool) -> None:
     """RMSE of x over links and cycles, from the same miscounting loops: by counting, and by the filter."""
+    _check_drawn(net)
     whole = network.load(net)
     known = calibration.for_model(whole, None)
     rows, error_list = [], numbers("errors", errors)
@@ -328,7 +336,7 @@ def foresight(forecasts: str, demands: str, noises: str, seeds: str, *, as_json:
             "noise": noise,
             "forecast": method,
             "total_delay_veh_h": delays[demand, noise, method],
-            "over_perfect": sum(delays[demand, noise, method]) / sum(delays[demand, noise, "perfect"]),
+            "over_perfect": comparing.ratio(delays[demand, noise, method], delays[demand, noise, "perfect"])[0],
         }
         for demand, noise in cases
         for method in methods
@@ -345,7 +353,7 @@ def foresight(forecasts: str, demands: str, noises: str, seeds: str, *, as_json:
                 f"{each['noise']:g}",
                 each["forecast"],
                 " ".join(f"{delay:.0f}" for delay in each["total_delay_veh_h"]),
-                f"{each['over_perfect']:.3f}",
+                "not known" if each["over_perfect"] is None else f"{each['over_perfect']:.3f}",
             ]
             for each in found
         ],
@@ -377,6 +385,7 @@ def bound(
     net: str, hours: float, demands: str, lost: str, measured: str | None, unhindered: str | None, as_json: bool
 ) -> None:
     """Delay that no controller can go below: the linear programme of tools/bounding.py."""
+    _check_drawn(net)
     found, rows = streets.named(net), []
     # Of a run in SUMO or not: demand and hours are what a run's may be.
     runs = [scenario(net=net, hours=hours, demand=each) for each in numbers("demands", demands)]
@@ -409,6 +418,12 @@ def bound(
     cells = [[f"{row['demand']:g}", f"{row['lost']:.0%}", f"{row['least_delay_veh_h']:.0f}"] for row in rows]
     title = f"no less delay on {net}, {hours:g} h" + (f", with the flows of {measured}" if measured else "")
     _show(title, ["demand", "time lost", "veh h"], cells)
+
+
+def _check_drawn(net: str) -> None:
+    """Raises SettingError for a net whose demand is somebody else's, where it has to be ours."""
+    if net.endswith(SUFFIX):
+        raise SettingError(f"setting 'net' is {net!r}: this goes by our own demand, name a shipped net or a .net.xml")
 
 
 def _unhindered(found: Network, runs: list[Scenario], unhindered: str, as_json: bool) -> None:

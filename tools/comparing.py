@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+import utn_controllers
 import utn_network
-from utn_sumo import bridge, campaign, case, controllers, native, streets
+import utn_sumo
+from utn_sumo import bridge, campaign, case, controllers, native, recording, streets
 from utn_sumo.case import SUFFIX
 from utn_sumo.errors import NetworkError, ResultError, SettingError
 from utn_sumo.importing import FITTED, TURNS
@@ -136,19 +138,31 @@ def results(wanted: Sequence[Job], workers: int | None, record: Path | None, tic
 def opened(wanted: Sequence[Job]) -> list[dict[str, Any]]:
     """What the line of each run begins with: its settings, and what is in the files that they name, by SHA-256.
 
-    Those are the net's with what goes with it beside it, the ones that a .sumocfg names, and those of classes of one's
-    own; not what such files read themselves.
+    Those are the net's with what goes with it beside it, the ones that a .sumocfg names, those of classes of one's own,
+    not what such files read themselves; and the project's, with the versions of what it runs on.
     """
+    code = _code()
     nets = {net: _digest(_net_files(net)) for net in {job["net"] for job in wanted}}
     named = {job[role] for job in wanted for role in WHO if role in job}
     own = {name: _digest([Path(name.rpartition(":")[0])]) for name in named if ".py:" in name}
     return [
         {
             "job": job,
-            "inputs": {"net": nets[job["net"]], **{role: own[job[role]] for role in WHO if job.get(role) in own}},
+            "inputs": {
+                "net": nets[job["net"]],
+                "code": code,
+                **{role: own[job[role]] for role in WHO if job.get(role) in own},
+            },
         }
         for job in wanted
     ]
+
+
+def _code() -> str:
+    """A digest of the project's packages and of the versions of what they run on."""
+    roots = [Path(str(package.__file__)).parent for package in (utn_sumo, utn_controllers, utn_network)]
+    sources = _digest([path for root in roots for path in sorted(root.rglob("*.py"))])
+    return hashlib.sha256(f"{sources}{recording.versions('')}".encode()).hexdigest()
 
 
 def _net_files(net: str) -> list[Path]:

@@ -37,7 +37,7 @@ LEAST_ENDS = 4
 
 def write(name: str, folder: Path, rng: np.random.Generator) -> Path:
     """Draw a net into `folder`, with its traffic; its .sumocfg. Raises UtnError."""
-    net = recording.new_folder(folder, "") / f"{name}.net.xml"
+    net = recording.new_folder(folder, "", "FOLDER") / f"{name}.net.xml"
     while True:
         words, people = _words(rng)
         seed = int(rng.integers(1, 1_000_000))
@@ -118,7 +118,7 @@ def _share(found: Network, stages: tuple[int, ...], need: Floats) -> float:
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option("--seed", type=int, default=7, show_default=True, help="What is drawn.")
+@click.option("--seed", type=click.IntRange(0), default=7, show_default=True, help="What is drawn.")
 @click.option("--count", type=click.IntRange(1), default=20, show_default=True, help="How many nets.")
 def main(folder: Path, seed: int, count: int) -> None:
     """Draw nets into FOLDER, a new folder each; print their .sumocfg."""

@@ -201,7 +201,7 @@ def imported(osm: Path, net: Path, seed: int, *, people: bool) -> None:
 
 def write(name: str, folder: Path, rng: np.random.Generator) -> Path:
     """Draw a town into `folder`, with its traffic; its .sumocfg. Raises UtnError."""
-    folder = recording.new_folder(folder, "")
+    folder = recording.new_folder(folder, "", "FOLDER")
     osm, net = folder / f"{name}.osm.xml", folder / f"{name}.net.xml"
     while True:
         town = drawn(rng)
@@ -216,7 +216,7 @@ def write(name: str, folder: Path, rng: np.random.Generator) -> Path:
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option("--seed", type=int, default=7, show_default=True, help="What is drawn.")
+@click.option("--seed", type=click.IntRange(0), default=7, show_default=True, help="What is drawn.")
 @click.option("--count", type=click.IntRange(1), default=20, show_default=True, help="How many towns.")
 def main(folder: Path, seed: int, count: int) -> None:
     """Draw towns into FOLDER, a new folder each; print their .sumocfg."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,7 @@ def draw(rows: Sequence[Figures], folder: Path) -> list[Path]:
     import matplotlib as mpl  # noqa: PLC0415 - heavy
 
     mpl.use("Agg")
+    mpl.rcParams["text.parse_math"] = False  # names may have dollars in them
     from matplotlib import pyplot as plt  # noqa: PLC0415 - heavy
 
     paths = []
@@ -145,10 +147,16 @@ def draw(rows: Sequence[Figures], folder: Path) -> list[Path]:
         )
         axes.grid(visible=True, which="both", linewidth=0.3)
         figure.legend(loc="outside right upper", frameon=False, fontsize=9)
-        paths.append(folder / f"{_short(net)}.png")
+        paths.append(_free(folder, _short(net)))
         figure.savefig(paths[-1], dpi=150)
         plt.close(figure)
     return paths
+
+
+def _free(folder: Path, name: str) -> Path:
+    """A picture's file that is not there yet: nets may be called alike."""
+    named = (folder / f"{name}{f'-{number}' if number > 1 else ''}.png" for number in count(1))
+    return next(path for path in named if not path.exists())
 
 
 def _short(net: str) -> str:

@@ -368,16 +368,17 @@ def draw(found: dict[str, Any], path: Path) -> None:
     for axis, cost in zip(axes, COSTS, strict=False):
         for mode, rows in (
             ("admm, warm", found.get("warm", [])),
-            ("admm", found["gap"]),
-            ("sensitivity", found["gap"]),
+            ("admm", found.get("gap", [])),
+            ("sensitivity", found.get("gap", [])),
         ):
             mine = [r for r in rows if r["cost"] == cost and r["coordination"] == mode.split(",")[0] and r["cap"]]
             if mine:
                 line = axis.plot([r["cap"] for r in mine], [100 * r["gap_mean"] for r in mine], "o-", label=mode)
                 worst = [100 * r["gap_max"] for r in mine]
                 axis.plot([r["cap"] for r in mine], worst, ":", color=line[0].get_color(), label="_worst")
-        alone = [100 * r["gap_mean"] for r in found["gap"] if r["cost"] == cost and r["coordination"] == "none"]
-        axis.axhline(alone[0], color="0.5", linestyle="--", label="none")
+        for row in found.get("gap", []):
+            if row["cost"] == cost and row["coordination"] == "none":
+                axis.axhline(100 * row["gap_mean"], color="0.5", linestyle="--", label="none")
         axis.set(xscale="log", yscale="log", xlabel="iterations", ylabel="gap to the optimum, %", title=f"cost {cost}")
         axis.set_ylim(bottom=1e-4)
         axis.legend(title="mean; dotted: worst")

@@ -13,9 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from utn_sumo import __version__
 from utn_sumo.errors import SettingError, UtnError
+
+MOST_DIGITS = 9
+"""Of a count: nobody waits for more."""
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -66,7 +70,7 @@ def run(pairs: tuple[str, ...], file: Path | None, out: Path | None, as_json: bo
     own = flags.pop("case")
     if own is not None and flags["net"] is not None:
         raise SettingError(f"setting 'net' is {flags['net']!r}, beside {own!r}: give one of them")
-    flags["net"] = flags["net"] or own
+    flags["net"] = own if flags["net"] is None else flags["net"]
     given: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
     chosen = scenario(file, settings=nested(settings), **given)
     with report.progress(chosen) as on_cycle:
@@ -130,7 +134,6 @@ def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: s
             with_floor=with_floor,
             tick=tick,
         )
-    recording.write_json(folder / "mismatch.json", {"results": results})
     click.echo(json.dumps(recording.plain(results))) if as_json else report.mismatch_table(results, folder)
 
 
@@ -147,8 +150,14 @@ def mismatch(out: Path | None, with_floor: bool | None, as_json: bool, demand: s
 @click.option("--refit-steps", default="15", show_default=True, help="Control steps between two fits of a model.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results; must be new or empty.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.")
-def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, as_json: bool, **flags: Any) -> None:
-    """Measure the forecasts' errors by method on the recorded runs in FOLDERS, or on runs made for it."""
+@click.pass_context
+def forecast_report(
+    context: click.Context, /, folders: tuple[Path, ...], seeds: str, out: Path | None, *, as_json: bool, **flags: Any
+) -> None:
+    """Measure the forecasts' errors by method on the recorded runs in FOLDERS, or on runs made for it.
+
+    Runs in FOLDERS differ by their seeds alone.
+    """
     from utn_sumo import campaign, recording, report, study  # noqa: PLC0415 - heavy
     from utn_sumo import forecast_report as judging  # noqa: PLC0415 - heavy
     from utn_sumo.scenario import scenario  # noqa: PLC0415 - heavy
@@ -156,12 +165,20 @@ def forecast_report(folders: tuple[Path, ...], seeds: str, out: Path | None, *, 
     steps, refit_steps = (_whole(name, flags.pop(name)) for name in ("horizon", "refit_steps"))
     seed_list = campaign.seeds(f"1-{_whole('seeds', seeds)}")
     items = [] if folders else [scenario(**flags, seed=seed) for seed in seed_list]
-    for path in folders:
-        judging.recorded(path)
+    if folders:
+        judging.check_alike(folders)
     if len(folders or items) < 2:  # noqa: PLR2004 - an interval needs two
         raise SettingError("forecasts are judged over runs: give two or more, as --seeds 2 or as folders")
-    folder = recording.new_folder(out, "forecast-report")
-    with report.counter("runs and forecasts", len(items) + len(folders or items)) as tick:
+    for name in (*flags, "seeds") if folders else ():
+        if context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
+            raise SettingError(f"--{name} is of runs to be made, and {str(folders[0])!r} holds one: give one of them")
+    if items and items[0].demand == 0:
+        raise SettingError("setting 'demand' is 0: there is nothing to forecast, make it more")
+    total = len(items) + len(folders or items)
+    with (
+        recording.results_in(out, "forecast-report") as folder,
+        report.counter("runs and forecasts", total) as tick,
+    ):
         runs = folders or study.record(items, folder, tick, judging.FIRST_STEP + steps + 1)
         result = study.study_forecasts(runs, folder, horizon=steps, refit_steps=refit_steps, tick=tick)
     recording.write_json(folder / "forecasts.json", result)
@@ -191,7 +208,7 @@ def calibrate(out: Path, demand: str | None, seeds: str, **flags: Any) -> None:
     path = folder / "calibration.json"
     recording.write_json(path, content)
     report.calibration_table(content)
-    click.echo(f"wrote {path}: use it with  utn run --calibration {path}, or put it beside the net")
+    click.echo(f"wrote {path}: use it with  utn run --calibration {shlex.quote(str(path))}, or put it beside the net")
 
 
 @cli.command()
@@ -243,13 +260,12 @@ def tune(
     tuning.library()
     space = search_space.space(controller, over, execution)
     demands = None if flags["demands"] is None else numbers("demands", flags["demands"])
-    bases = tuning.bases(flags["nets"].split(","), demands, flags["hours"])
+    bases = tuning.bases(words("nets", flags["nets"]), demands, flags["hours"])
     task = tuning.Task(controller, space, bases, campaign.seeds(flags["seeds"]), execution)
     task.check()
     trials = _whole("trials", flags["trials"])
     names = "-".join(Path(each.partition(":")[0]).stem for each in task.who.values())
-    folder = recording.new_folder(out, f"tune-{names}")
-    with report.counter("trials", trials + 1) as tick:
+    with recording.results_in(out, f"tune-{names}") as folder, report.counter("trials", trials + 1) as tick:
         result = tuning.tune(task, trials, seed, folder, tick)
     report.tuning_table(result)
     if result["interrupted"]:
@@ -360,7 +376,11 @@ def _base(flags: dict[str, Any]) -> dict[str, Any]:
         raise SettingError(f"setting 'net' is {net!r}, beside {own!r}: give one of them")
     if own is None and hours is None:
         hours = "2"
-    return {"net": own or net or "utn17", "controller": flags["controller"], **({"hours": hours} if hours else {})}
+    return {
+        "net": own or ("utn17" if net is None else net),
+        "controller": flags["controller"],
+        **({"hours": hours} if hours else {}),
+    }
 
 
 def _step_s(flags: dict[str, Any]) -> float | None:
@@ -373,6 +393,14 @@ def _step_s(flags: dict[str, Any]) -> float | None:
     return step_s
 
 
+def words(name: str, text: str) -> list[str]:
+    """Words separated by commas, each once. Raises SettingError."""
+    found = [word.strip() for word in text.split(",")]
+    if len(set(found)) < len(found):
+        raise SettingError(f"setting {name!r} is {text!r}: give each word once")
+    return found
+
+
 def numbers(name: str, text: str) -> list[float]:
     """Numbers separated by commas, each once. Raises SettingError."""
     try:
@@ -381,14 +409,15 @@ def numbers(name: str, text: str) -> list[float]:
         found = []
     if not found or not all(map(math.isfinite, found)):
         raise SettingError(f"setting {name!r} is {text!r}: it must be numbers separated by commas")
-    if len(set(found)) < len(found):
+    # Runs are called by six digits of them.
+    if len({f"{number:g}" for number in found}) < len(found):
         raise SettingError(f"setting {name!r} is {text!r}: give each number once")
     return found
 
 
 def _whole(name: str, text: str) -> int:
     """A whole number from 1 on. Raises SettingError."""
-    if not text.isdecimal() or int(text) == 0:
+    if not text.isdecimal() or len(text) > MOST_DIGITS or int(text) == 0:
         raise SettingError(f"setting {name!r} is {text!r}: it must be a whole number from 1 on")
     return int(text)
 
@@ -397,7 +426,7 @@ def _number(text: str | None) -> Any:
     """The value that JSON reads in a flag's text, else the text: 7, 0.1, true, tts."""
     try:
         return json.loads(text or "")
-    except json.JSONDecodeError:
+    except ValueError:  # also of more digits than Python takes for a number
         return text
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from utn_sumo import demand, network, recording
+from utn_sumo import case, demand, network, recording
 from utn_sumo.case import SUFFIX
 from utn_sumo.contract import Floats, Network
 from utn_sumo.errors import ResultError, SettingError
@@ -41,6 +41,30 @@ def recorded(folder: Path) -> Scenario:
         ) from error
 
 
+def check_alike(folders: Sequence[Path]) -> None:
+    """Raises SettingError for recorded runs that differ in more than their seeds, or a seed that two of them have.
+
+    Raises ResultError for a folder that holds no run.
+    """
+    first, *others = ((folder, recorded(folder)) for folder in folders)
+    seeds = {first[1].seed: first[0]}
+    for folder, chosen in others:
+        for name in Scenario.model_fields:
+            mine, its = getattr(chosen, name), getattr(first[1], name)
+            if name not in {"seed", "net"} and mine != its:
+                raise SettingError(
+                    f"run {str(folder)!r} has {name} {mine!r}, and {str(first[0])!r} {its!r}: forecasts are judged "
+                    "over runs that differ by their seeds alone"
+                )
+        if case.digest(folder / recording.NET) != case.digest(first[0] / recording.NET):
+            raise SettingError(f"runs {str(folder)!r} and {str(first[0])!r} are of two nets: give runs of one")
+        if chosen.seed in seeds:
+            raise SettingError(
+                f"runs {str(folder)!r} and {str(seeds[chosen.seed])!r} have one seed, {chosen.seed}: give one of them"
+            )
+        seeds[chosen.seed] = folder
+
+
 def rmse_veh_h(folder: Path, horizon: int, refit_steps: int) -> dict[str, list[float]]:
     """Of one recorded run, by method and step ahead; plain data, so that runs can be judged in processes of their own.
 
@@ -49,7 +73,7 @@ def rmse_veh_h(folder: Path, horizon: int, refit_steps: int) -> dict[str, list[f
     scenario = recorded(folder)
     if scenario.net.endswith(SUFFIX):
         raise SettingError(f"setting 'net' is {scenario.net!r}: forecasts are judged where the demand was drawn")
-    net = network.load(scenario.net)
+    net = network.load(str(folder / recording.NET))
     log = recording.read_log(folder)
     steps = len(log.green_s)
     if steps <= FIRST_STEP + horizon:

@@ -210,6 +210,7 @@ def _pyplot() -> Any:
     import matplotlib as mpl  # noqa: PLC0415 - heavy
 
     mpl.use("Agg")
+    mpl.rcParams["text.parse_math"] = False  # names may have dollars in them
     from matplotlib import pyplot as plt  # noqa: PLC0415 - after the backend is chosen
 
     return plt

@@ -105,7 +105,7 @@ def scenario(file: Path | None = None, **given: Any) -> Scenario:
     if file is not None:
         try:
             values = tomllib.loads(file.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise SettingError(f"scenario file {str(file)!r} can't be read ({error}): name a TOML file") from error
     table = values.get("settings", {})
     if not isinstance(table, dict):

@@ -36,10 +36,10 @@ INPUTS = ("known", "forecast")
 def record(scenarios: Sequence[Scenario], folder: Path, tick: Callable[[], None], least_steps: int = 1) -> list[Path]:
     """Run the scenarios in parallel processes and return their result folders; `tick` is called after each.
 
-    Raises SettingError before any if they will have no record of control steps, or fewer than `least_steps`.
+    Raises SettingError before any that `check` refuses.
     """
     for item in scenarios:
-        _check(item, least_steps)
+        check(item, least_steps)
     jobs = [(item, folder / "runs" / f"demand{item.demand:g}-seed{item.seed}") for item in scenarios]
     with processes.pool(afresh=True) as pool:
         for _ in pool.map(_record, jobs):
@@ -51,7 +51,8 @@ def _record(job: tuple[Scenario, Path]) -> None:
     bridge.run(*job)
 
 
-def _check(item: Scenario, least_steps: int) -> None:
+def check(item: Scenario, least_steps: int) -> None:
+    """Raises SettingError for a scenario without a record of control steps, or with fewer than `least_steps`."""
     if item.controller in sumo_signals.RUNS:
         raise SettingError(
             f"setting 'controller' is {item.controller!r}: SUMO switches its signals, and no control step is on "
@@ -82,7 +83,7 @@ def study_mismatch(
     with_floor: bool,
     tick: Callable[[], None],
 ) -> list[dict[str, Any]]:
-    """The mismatch by demand: one object each, under the names of `mismatch.summary`.
+    """The mismatch by demand: one object each, under the names of `mismatch.summary`, also in `folder`/mismatch.json.
 
     The net of `base` may be a .sumocfg, whose traffic `demands` scale. Without a `step_s` the model steps as the loops
     are read, every 10 s or as near under it as divides the control step.
@@ -125,6 +126,8 @@ def study_mismatch(
             }
         )
         plots.mismatch(results[-1], model, found, folder)
+        # One that is stopped keeps what it has.
+        recording.write_json(folder / "mismatch.json", {"results": results})
     return results
 
 

@@ -271,6 +271,14 @@ def trips(file: Path) -> list[dict[str, str]]:
         (("run", "--calibration", "nowhere.json"), ["'nowhere.json'", "can't be read", "utn calibrate"]),
         (("run", "--net", "routes.xml"), ["'routes.xml'", "holds no roads", "netconvert"]),
         (("forecast-report", "nowhere"), ["'nowhere'", "settings.json"]),
+        (("forecast-report", "--demand", "0", "--out", "new"), ["'demand' is 0", "nothing to forecast"]),
+        (("tune", "priced", "--nets", "utn17,utn17", "--out", "new"), ["'utn17,utn17'", "each word once"]),
+        (("mismatch", "--demand", "1,1.0000001", "--out", "new"), ["'1,1.0000001'", "each number once"]),
+        (("mismatch", "--horizon", "9" * 5000, "--out", "new"), ["'horizon'", "a whole number"]),
+        (("run", "--net", "", "--out", "new"), ["net ''"]),
+        (("run", "--scenario", "deep.toml", "--out", "new"), ["'deep.toml'", "name a TOML file"]),
+        (("run", "--scenario", "long.toml", "--out", "new"), ["'long.toml'", "name a TOML file"]),
+        (("run", "--set", "horizon=" + "9" * 5000, "--out", "new"), ["'horizon'"]),
         (("forecast-report", "empty", "empty"), ["'empty'", "a run's scenario", "`utn run` wrote"]),
         (("forecast-report", "list", "list"), ["'list'", "settings.json", "`utn run` wrote"]),
         (("forecast-report", "typo", "typo"), ["'typo'", "'hourz' is unknown", "`utn run` wrote"]),
@@ -285,6 +293,8 @@ def test_what_cannot_be_is_said_before_anything_is_run(
         (folder / name).mkdir()
         (folder / name / "settings.json").write_text(content, encoding="utf-8")
     (folder / "routes.xml").write_text("<routes/>", encoding="utf-8")
+    (folder / "deep.toml").write_text("net = " + 5000 * "[", encoding="utf-8")
+    (folder / "long.toml").write_text("seed = " + 5000 * "9", encoding="utf-8")
     line = one_line(refused(*arguments))
     assert [word for word in words if word not in line] == []
     # Another try may have the same folder.

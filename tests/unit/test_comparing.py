@@ -15,7 +15,7 @@ from scipy import stats
 import comparing
 import showing
 from tests.integration import odd_nets
-from utn_sumo import campaign
+from utn_sumo import campaign, recording
 from utn_sumo.errors import ResultError, SettingError, UtnError
 
 DELAYS = st.lists(st.tuples(st.floats(10, 1000), st.floats(10, 1000)), min_size=3, max_size=10)
@@ -121,6 +121,15 @@ def test_one_of_which_every_run_failed_leaves_the_others_their_tables_and_pictur
     assert "failed" in cells[0]
     (path,) = showing.draw(rows, tmp_path)
     assert path.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "names", [("a/town.sumocfg", "b/a/town.net.xml", "a/town.sumocfg.net.xml"), ("a$_$b", "c$^$d")]
+)
+def test_every_net_has_a_picture_of_its_own_whatever_it_is_called(tmp_path: Path, names: tuple[str, ...]) -> None:
+    rows = [row for name in names for row in comparing.figures(*runs(name, mine=[10, 12], other=[3, 4]))]
+    pictures = showing.draw(rows, tmp_path)
+    assert len(set(pictures)) == len(list(tmp_path.iterdir())) == len(names)
 
 
 def test_alarms_are_added_up_and_what_is_not_known_is_not_zero() -> None:
@@ -275,6 +284,19 @@ def test_what_was_made_from_files_that_have_changed_is_run_again_and_stays_on_re
     if before is not None:
         file.write_bytes(before)
         assert delays() == [10, 20]
+
+
+def test_what_other_code_has_run_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs, _ = runs(mine=[10])
+    started: list[Any] = []
+    monkeypatch.setattr(campaign, "_alone", lambda job: started.append(job) or result(10))
+    monkeypatch.setattr(recording, "versions", lambda _: {"libsumo": "1.27.0"})
+    comparing.results(jobs, 1, tmp_path / "runs.jsonl", lambda: None)
+    monkeypatch.undo()
+    monkeypatch.setattr(campaign, "_alone", lambda job: started.append(job) or result(10))
+    for _ in range(2):
+        comparing.results(jobs, 1, tmp_path / "runs.jsonl", lambda: None)
+    assert len(started) == 2
 
 
 def test_a_line_that_does_not_tell_its_files_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
