@@ -381,7 +381,8 @@ def draw(found: dict[str, Any], path: Path) -> None:
                 axis.axhline(100 * row["gap_mean"], color="0.5", linestyle="--", label="none")
         axis.set(xscale="log", yscale="log", xlabel="iterations", ylabel="gap to the optimum, %", title=f"cost {cost}")
         axis.set_ylim(bottom=1e-4)
-        axis.legend(title="mean; dotted: worst")
+        if axis.lines:
+            axis.legend(title="mean; dotted: worst")
     rows = [row for row in found.get("loop", []) if row["cap"]]
     spent = [row["total_time_spent_veh_h"] for row in rows]
     axes[2].plot([row["cap"] for row in rows], spent, "o-", label="admm, warm")
@@ -389,7 +390,8 @@ def draw(found: dict[str, Any], path: Path) -> None:
         axes[2].axhline(row["total_time_spent_veh_h"], color=colour, linestyle="--", label=row["coordination"])
     axes[2].set(xscale="log", ylim=(0, None), xlabel="most iterations in a step", ylabel="time spent in SUMO, veh h")
     axes[2].set_title("closed loop, demand 1.3, seeds 1-3")
-    axes[2].legend()
+    if axes[2].lines:
+        axes[2].legend()
     for axis in axes:
         axis.set_xticks((1, 2, 5, 10, 20, 40), ("1", "2", "5", "10", "20", "40"))
     figure.savefig(path, dpi=110)

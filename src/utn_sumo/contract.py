@@ -174,6 +174,8 @@ class Junction:
     """Letters that need none: pedestrian crossings', and those of no stream."""
     made_to_yield: tuple[int, ...] = ()
     """Letters that give way (g) in stages in which the net itself protects them (G) beside others that they meet."""
+    given_yellow: tuple[int, ...] = ()
+    """Letters that have yellow at the end of greens that in the net itself end in red at once."""
     callers: tuple[Caller, ...] = ()
     """In the order of their letters."""
 

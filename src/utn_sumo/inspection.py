@@ -39,6 +39,7 @@ def _junction(network: Network, index: int, refused: Mapping[str, str]) -> dict[
         "links": [link.id for link in part.links],
         "refused": refused.get(junction.id, ""),
         "made_to_yield": list(junction.made_to_yield),
+        "given_yellow": list(junction.given_yellow),
     }
 
 

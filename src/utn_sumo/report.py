@@ -229,8 +229,9 @@ def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
 def _controlled(junction: dict[str, Any]) -> str:
     if junction["refused"]:
         return f"no: {junction['refused']}"
-    late = ", ".join(map(str, junction["made_to_yield"]))
-    return f"yes, signal {late} gives way to who has green with it" if late else "yes"
+    late, bare = (", ".join(map(str, junction[key])) for key in ("made_to_yield", "given_yellow"))
+    said = ["yes", *([f"signal {late} gives way to who has green with it"] if late else [])]
+    return ", ".join([*said, *([f"signal {bare} is given the yellow that it lacks"] if bare else [])])
 
 
 def inspection_table(found: dict[str, Any], folder: Path) -> None:

@@ -728,6 +728,16 @@ def no_yellow(folder: Path) -> Path:
     return case(folder, traffic("AB"))
 
 
+def yellow_forgotten(folder: Path) -> Path:
+    """The north's green goes on beyond its street's, and ends in red at once."""
+    phases = (
+        *((20, NORTH_SOUTH), (3, "GGgrrryyyrrr"), (12, "GGgrrrrrrrrr"), (2, DARK)),
+        *((20, EAST_WEST), (3, "rrryyyrrryyy"), (2, DARK)),
+    )
+    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", phases))
+    return case(folder, traffic("C"))
+
+
 def switched_off(folder: Path) -> Path:
     """A blinks, B is dark, D is switched off by an additional file; H alone works."""
     net = row("ABDH", gap_m=120).net(folder, NO_TURNAROUNDS)
@@ -1024,6 +1034,7 @@ CASES: tuple[Make, ...] = (
     shared_letters,
     leading_green,
     lagging_green,
+    yellow_forgotten,
     red_and_amber,
     green_beside_amber,
     no_yellow,

@@ -276,7 +276,10 @@ def test_inspect_names_every_signal(make: Make, made: Callable[[Make], Path], tm
     assert {item["id"] for item in found["junctions"]} | set(found["left_alone"]) == signals_of(file)
 
 
-@every_case
+# What is given yellow shows phases that the net's own programme has not.
+@pytest.mark.parametrize(
+    "make", [make for make in odd_nets.CASES if make is not odd_nets.yellow_forgotten], ids=lambda make: make.__name__
+)
 def test_phases_keep_their_order_and_clearances_their_seconds(
     make: Make, made: Callable[[Make], Path], ran: Run
 ) -> None:
@@ -309,11 +312,12 @@ def test_no_stream_turns_green_sooner_after_another_than_in_the_nets_own_program
             assert seconds >= least.get(pair, 0), (signal, pair)
 
 
-# A change of programmes cuts a green short, which is what the monitor is there to see.
+UNSAFE = {odd_nets.programmes_by_the_clock, odd_nets.yellow_forgotten}
+"""A change of programmes cuts a green short, which is what the monitor is there to see, as it sees no yellow."""
+
+
 @pytest.mark.parametrize(
-    "make",
-    [make for make in odd_nets.CASES if make is not odd_nets.programmes_by_the_clock],
-    ids=lambda make: make.__name__,
+    "make", [make for make in odd_nets.CASES if make not in UNSAFE], ids=lambda make: make.__name__
 )
 def test_the_monitor_has_nothing_to_say_against_a_nets_own_programme(
     make: Make, made: Callable[[Make], Path], ran: Run
@@ -323,6 +327,14 @@ def test_the_monitor_has_nothing_to_say_against_a_nets_own_programme(
     net = streets.controllable(chosen)
     verdict = monitor.watch(net, folder / "signals.xml", result["hours"] * 3600, chosen.begin_s)
     assert not verdict.reasons
+
+
+def test_a_green_without_yellow_is_seen_under_the_nets_own_programme_and_mended_under_others(ran: Run) -> None:
+    verdict, _ = ran(odd_nets.yellow_forgotten, "native")
+    assert any("without yellow" in reason for reason in verdict["unsafe_reasons"])
+    for controller in CONTROLLERS:
+        result, _ = ran(odd_nets.yellow_forgotten, controller)
+        assert (result["left_alone"], result["unsafe_reasons"]) == ({}, [])
 
 
 @pytest.mark.parametrize("make", LEFT_ALONE, ids=lambda make: make.__name__)

@@ -306,3 +306,30 @@ def test_why_a_signal_is_left_alone_is_said(found: Programme | None, signals: in
     why = programmes.why_left_alone(found, signals, range(signals), ())
     assert reason in why
     assert bool(why) == bool(reason)
+
+
+FORGOTTEN = ((20, "GGrr"), (3, "Gyrr"), (12, "Grrr"), (2, "rrrr"), (20, "rrGG"), (3, "rryy"), (2, "rrrr"))
+"""The first letter's green goes on and ends in red at once."""
+
+
+def test_a_green_that_ends_without_yellow_is_given_what_the_programme_has_elsewhere_out_of_its_own_time() -> None:
+    given = programme(*FORGOTTEN)
+    assert given.without_yellow({0, 1, 2, 3}) == {0}
+    mended = given.cleared({0})
+    shown = [(phase.state, phase.duration_s) for phase in mended.phases]
+    assert shown[2:5] == [("Grrr", 9), ("yrrr", 3), ("rrrr", 2)]
+    assert mended.cycle_s == given.cycle_s
+    assert mended.without_yellow({0, 1, 2, 3}) == set()
+
+
+def test_who_needs_no_yellow_and_a_programme_that_knows_none_stay_as_they_are() -> None:
+    given = programme(*FORGOTTEN)
+    assert given.without_yellow({1, 2, 3}) == set()
+    bare = programme((25, "GGrr"), (2, "rrrr"), (25, "rrGG"), (2, "rrrr"))
+    assert bare.without_yellow({0, 1, 2, 3}) == set()
+    assert bare.cleared({0, 1, 2, 3}) == bare
+
+
+def test_a_green_too_short_for_yellow_stays_as_it_is() -> None:
+    given = programme((20, "GGrr"), (3, "Gyrr"), (3, "Grrr"), (2, "rrrr"), *TWO_STAGES[3:])
+    assert given.cleared({0}) == given

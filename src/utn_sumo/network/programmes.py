@@ -103,6 +103,41 @@ class Programme:
             phases.append(replace(phase, state=state))
         return replace(self, phases=tuple(phases))
 
+    def without_yellow(self, letters: Collection[int]) -> set[int]:
+        """Of these letters those whose green ends in red at once, though the programme knows yellow."""
+        if not self._yellow_s:
+            return set()
+        return {letter for _, ending in self._ending(letters) for letter in ending}
+
+    def cleared(self, letters: Collection[int]) -> Programme:
+        """With yellow, as long as it has it elsewhere, at the end of these letters' greens that end in red at once.
+
+        A green that is too short for that stays as it is. The cycle is as long as before.
+        """
+        phases: list[Phase] = []
+        for phase, ending in self._ending(letters):
+            left_s = phase.duration_s - self._yellow_s
+            if not ending or not self._yellow_s or left_s < 1:
+                phases.append(phase)
+                continue
+            state = "".join("y" if letter in ending else shown for letter, shown in enumerate(phase.state))
+            least_s = None if phase.least_s is None else min(phase.least_s, left_s)
+            phases += [
+                replace(phase, duration_s=left_s, least_s=least_s),
+                replace(phase, state=state, duration_s=self._yellow_s, least_s=None),
+            ]
+        return replace(self, phases=tuple(phases))
+
+    @property
+    def _yellow_s(self) -> float:
+        """The longest yellow that any letter has in one phase."""
+        return max((phase.duration_s for phase in self.phases if set(phase.state) & set("yY")), default=0.0)
+
+    def _ending(self, letters: Collection[int]) -> Iterator[tuple[Phase, set[int]]]:
+        """Each phase, and which of the letters have green in it and red at once after it."""
+        for phase, then in zip(self.phases, [*self.phases[1:], *self.phases[:1]], strict=True):
+            yield phase, {letter for letter in phase.green.intersection(letters) if then.state[letter] == "r"}
+
     @property
     def cycle_s(self) -> float:
         """Its length."""

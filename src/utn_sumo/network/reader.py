@@ -210,7 +210,8 @@ class _Reader:
         for position, signal in enumerate(self.signals):
             assert signal.programme is not None
             second = signal.second()
-            programme = signal.programme.yielding(second)
+            bare = signal.programme.without_yellow(signal.of_vehicles)
+            programme = signal.programme.yielding(second).cleared(bare)
             signal_turns = self._signal_turns(signal, turn_index)
             first = len(stages)
             walked = set(range(signal.letters)) - signal.of_vehicles
@@ -225,6 +226,7 @@ class _Reader:
                     conflicts=signal.conflicts,
                     without_yellow=tuple(sorted(walked)),
                     made_to_yield=tuple(sorted({letter for letter, _ in second})),
+                    given_yellow=tuple(sorted(bare)),
                     callers=signal.callers,
                 )
             )
