@@ -176,6 +176,8 @@ class Junction:
     """Letters that give way (g) in stages in which the net itself protects them (G) beside others that they meet."""
     given_yellow: tuple[int, ...] = ()
     """Letters that have yellow at the end of greens that in the net itself end in red at once."""
+    kept_waiting: tuple[int, ...] = ()
+    """Letters that have way when whom they meet is cleared; in the net itself they have it sooner."""
     callers: tuple[Caller, ...] = ()
     """In the order of their letters."""
 

@@ -40,6 +40,7 @@ def _junction(network: Network, index: int, refused: Mapping[str, str]) -> dict[
         "refused": refused.get(junction.id, ""),
         "made_to_yield": list(junction.made_to_yield),
         "given_yellow": list(junction.given_yellow),
+        "kept_waiting": list(junction.kept_waiting),
     }
 
 

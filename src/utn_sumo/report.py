@@ -229,9 +229,13 @@ def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
 def _controlled(junction: dict[str, Any]) -> str:
     if junction["refused"]:
         return f"no: {junction['refused']}"
-    late, bare = (", ".join(map(str, junction[key])) for key in ("made_to_yield", "given_yellow"))
-    said = ["yes", *([f"signal {late} gives way to who has green with it"] if late else [])]
-    return ", ".join([*said, *([f"signal {bare} is given the yellow that it lacks"] if bare else [])])
+    mended = {
+        "made_to_yield": "gives way to who has green with it",
+        "given_yellow": "is given the yellow that it lacks",
+        "kept_waiting": "waits until others are cleared",
+    }
+    said = [f"signal {', '.join(map(str, junction[key]))} {how}" for key, how in mended.items() if junction[key]]
+    return ", ".join(["yes", *said])
 
 
 def inspection_table(found: dict[str, Any], folder: Path) -> None:

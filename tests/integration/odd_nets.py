@@ -738,6 +738,16 @@ def yellow_forgotten(folder: Path) -> Path:
     return case(folder, traffic("C"))
 
 
+def green_too_soon(folder: Path) -> Path:
+    """The street across has way in the last of three seconds of yellow."""
+    phases = (
+        *((25, NORTH_SOUTH), (2, "yyyrrryyyrrr"), (1, "yyyGGgyyyGGg"), (20, EAST_WEST)),
+        *((3, "rrryyyrrryyy"), (2, DARK)),
+    )
+    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", phases))
+    return case(folder, traffic("C"))
+
+
 def switched_off(folder: Path) -> Path:
     """A blinks, B is dark, D is switched off by an additional file; H alone works."""
     net = row("ABDH", gap_m=120).net(folder, NO_TURNAROUNDS)
@@ -1035,6 +1045,7 @@ CASES: tuple[Make, ...] = (
     leading_green,
     lagging_green,
     yellow_forgotten,
+    green_too_soon,
     red_and_amber,
     green_beside_amber,
     no_yellow,

@@ -35,7 +35,6 @@ CONTROLLERS = ("fixed", "dmpc", "cmpc")
 LEFT_ALONE: dict[Make, set[str]] = {
     odd_nets.one_stage: {"M", "F"},
     odd_nets.railway: {"R", "X"},
-    odd_nets.tram_stage: {"T"},
     odd_nets.no_yellow: {"A"},
     odd_nets.switched_off: {"A", "B", "D"},
     odd_nets.blinking_at_night: {"C"},
@@ -276,9 +275,12 @@ def test_inspect_names_every_signal(make: Make, made: Callable[[Make], Path], tm
     assert {item["id"] for item in found["junctions"]} | set(found["left_alone"]) == signals_of(file)
 
 
-# What is given yellow shows phases that the net's own programme has not.
+MENDED = {odd_nets.yellow_forgotten, odd_nets.green_too_soon}
+"""They show phases that the net's own programme has not."""
+
+
 @pytest.mark.parametrize(
-    "make", [make for make in odd_nets.CASES if make is not odd_nets.yellow_forgotten], ids=lambda make: make.__name__
+    "make", [make for make in odd_nets.CASES if make not in MENDED], ids=lambda make: make.__name__
 )
 def test_phases_keep_their_order_and_clearances_their_seconds(
     make: Make, made: Callable[[Make], Path], ran: Run
@@ -312,8 +314,8 @@ def test_no_stream_turns_green_sooner_after_another_than_in_the_nets_own_program
             assert seconds >= least.get(pair, 0), (signal, pair)
 
 
-UNSAFE = {odd_nets.programmes_by_the_clock, odd_nets.yellow_forgotten}
-"""A change of programmes cuts a green short, which is what the monitor is there to see, as it sees no yellow."""
+UNSAFE = {odd_nets.programmes_by_the_clock, *MENDED}
+"""A change of programmes cuts a green short, which is what the monitor is there to see, as what others mend."""
 
 
 @pytest.mark.parametrize(
@@ -329,11 +331,16 @@ def test_the_monitor_has_nothing_to_say_against_a_nets_own_programme(
     assert not verdict.reasons
 
 
-def test_a_green_without_yellow_is_seen_under_the_nets_own_programme_and_mended_under_others(ran: Run) -> None:
-    verdict, _ = ran(odd_nets.yellow_forgotten, "native")
-    assert any("without yellow" in reason for reason in verdict["unsafe_reasons"])
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [(odd_nets.yellow_forgotten, "without yellow"), (odd_nets.green_too_soon, "are open together")],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_an_unsafe_programme_is_seen_under_native_and_mended_under_others(ran: Run, make: Make, says: str) -> None:
+    verdict, _ = ran(make, "native")
+    assert any(says in reason for reason in verdict["unsafe_reasons"])
     for controller in CONTROLLERS:
-        result, _ = ran(odd_nets.yellow_forgotten, controller)
+        result, _ = ran(make, controller)
         assert (result["left_alone"], result["unsafe_reasons"]) == ({}, [])
 
 

@@ -271,6 +271,7 @@ SHOWN_NETS = [
     odd_nets.leading_green,
     odd_nets.lagging_green,
     odd_nets.yellow_forgotten,
+    odd_nets.green_too_soon,
     odd_nets.red_and_amber,
     odd_nets.green_beside_amber,
     odd_nets.joined,

@@ -96,7 +96,7 @@ def test_phases_alike_in_a_row_are_one() -> None:
 def test_a_programme_that_shows_one_thing_only_has_one_stage() -> None:
     found = programme((30, "GG"), (60, "GG"))
     assert [(block.stage.duration_s, block.clearance) for block in found.blocks] == [(90, ())]
-    assert "one stage" in programmes.why_left_alone(found, 2, (), ())
+    assert "one stage" in programmes.why_left_alone(found, 2, ())
 
 
 @pytest.mark.parametrize(
@@ -174,10 +174,9 @@ def test_who_has_green_for_four_seconds_only_has_a_stage_and_who_keeps_his_for_f
 
 def test_a_signal_is_left_alone_whom_a_stage_would_forget() -> None:
     found = programme((30, "Grr"), (4, "yGr"), (20, "rrG"), (4, "rry"))
-    assert "signal 1 has green amid clearances only" in programmes.why_left_alone(found, 3, range(3), ())
+    assert "signal 1 has green amid clearances only" in programmes.why_left_alone(found, 3, range(3))
     # Whoever uses no motor.
-    assert programmes.why_left_alone(found, 3, (0, 2), (1,)) == ""
-    assert "trams or bicycles alone" in programmes.why_left_alone(found, 3, (0, 1), (2,))
+    assert programmes.why_left_alone(found, 3, (0, 2)) == ""
 
 
 @given(shown=SHOWN, turn=st.integers(0, 8), offset_s=st.integers(-50, 50))
@@ -254,7 +253,7 @@ def test_a_programme_of_an_additional_file_whose_phases_name_their_successors_is
         'duration="3" state="ry"',
     )
     found = added(written(tmp_path, logic("C", *phases)))["C"]
-    assert "next" in programmes.why_left_alone(found, 2, (), ())
+    assert "next" in programmes.why_left_alone(found, 2, ())
 
 
 def test_what_an_additional_file_includes_stands_where_it_is_included(tmp_path: Path) -> None:
@@ -303,7 +302,7 @@ def test_signals_that_sumo_switches_itself_are_named_until_a_later_programme_sta
     ids=["none", "off", "no green", "one stage", "few letters", "uneven", "good"],
 )
 def test_why_a_signal_is_left_alone_is_said(found: Programme | None, signals: int, reason: str) -> None:
-    why = programmes.why_left_alone(found, signals, range(signals), ())
+    why = programmes.why_left_alone(found, signals, range(signals))
     assert reason in why
     assert bool(why) == bool(reason)
 
@@ -333,3 +332,15 @@ def test_who_needs_no_yellow_and_a_programme_that_knows_none_stay_as_they_are() 
 def test_a_green_too_short_for_yellow_stays_as_it_is() -> None:
     given = programme((20, "GGrr"), (3, "Gyrr"), (3, "Grrr"), (2, "rrrr"), *TWO_STAGES[3:])
     assert given.cleared({0}) == given
+
+
+def test_who_gets_way_while_another_whom_he_meets_is_cleared_waits_for_that() -> None:
+    meet = [[False, True], [True, False]]
+    given = programme((20, "Gr"), (2, "yr"), (1, "yG"), (20, "rG"), (3, "ry"), (2, "rr"))
+    assert given.too_soon(meet) == {(2, 1)}
+    assert [phase.state for phase in given.waiting({(2, 1)}).phases] == ["Gr", "yr", "yr", "rG", "ry", "rr"]
+    goes_on = programme((20, "Gg"), (3, "yG"), (20, "rG"), (3, "ry"), (2, "rr"))
+    assert [phase.state for phase in goes_on.waiting(goes_on.too_soon(meet)).phases][:3] == ["Gg", "yg", "rG"]
+    # Who is cleared from a green that gave way gives way still, and who is at peace may go.
+    assert programme((20, "gr"), (3, "yG"), (20, "rG"), (3, "ry"), (2, "rr")).too_soon(meet) == set()
+    assert given.too_soon([[False, False], [False, False]]) == set()

@@ -103,6 +103,34 @@ class Programme:
             phases.append(replace(phase, state=state))
         return replace(self, phases=tuple(phases))
 
+    def too_soon(self, conflicts: Sequence[Sequence[bool]]) -> set[tuple[int, int]]:
+        """(phase, letter) where a letter gets way while one that it meets is being cleared from having had it."""
+        found: set[tuple[int, int]] = set()
+        for index, phase in enumerate(self.phases):
+            for letter, (was, shown) in enumerate(zip(self.phases[index - 1].state, phase.state, strict=True)):
+                begins = shown == "G" and (was != "G" or (index - 1, letter) in found)
+                if begins and any(foe and self._clears(index, other) for other, foe in enumerate(conflicts[letter])):
+                    found.add((index, letter))
+        return found
+
+    def waiting(self, too_soon: Collection[tuple[int, int]]) -> Programme:
+        """With what they had before in place of these: red, or a green that gives way."""
+        phases: list[Phase] = []
+        for index, phase in enumerate(self.phases):
+            before = (phases or self.phases)[-1].state
+            state = "".join(
+                ("g" if before[letter] in GREEN else "r") if (index, letter) in too_soon else shown
+                for letter, shown in enumerate(phase.state)
+            )
+            phases.append(replace(phase, state=state))
+        return replace(self, phases=tuple(phases))
+
+    def _clears(self, index: int, letter: int) -> bool:
+        """Whether a phase has a letter's yellow after a green that had way."""
+        shown = [self.phases[index - back].state[letter] for back in range(len(self.phases))]
+        before = next((each for each in shown if each not in "yY"), "")
+        return shown[0] in "yY" and before == "G"
+
     def without_yellow(self, letters: Collection[int]) -> set[int]:
         """Of these letters those whose green ends in red at once, though the programme knows yellow."""
         if not self._yellow_s:
@@ -262,11 +290,8 @@ def _phase(element: Any) -> Phase:
     return Phase(element.get("state", ""), duration_s, None if least is None else float(least), elsewhere)
 
 
-def why_left_alone(programme: Programme | None, signals: int, motor: Collection[int], beside: Collection[int]) -> str:
-    """Why a signal with so many letters in use can't be controlled; empty if it can.
-
-    Of these letters some are of `motor` traffic, some of trams and bicycles `beside` it.
-    """
+def why_left_alone(programme: Programme | None, signals: int, motor: Collection[int]) -> str:
+    """Why a signal with so many letters in use, some of `motor` traffic, can't be controlled; empty if it can."""
     if programme is None:
         return "it has no signal programme, as rail signals have none"
     states = [phase.state for phase in programme.phases]
@@ -281,13 +306,6 @@ def why_left_alone(programme: Programme | None, signals: int, motor: Collection[
         return f"its programme has {few[stages == 0]}"
     if any(len(state) != len(states[0]) or len(state) < signals for state in states):
         return f"its programme's states have not a letter for each of its {signals} signals"
-    return _whom_no_stage_serves(programme, motor, beside)
-
-
-def _whom_no_stage_serves(programme: Programme, motor: Collection[int], beside: Collection[int]) -> str:
-    stages = [programme.phases[index].green for index in programme.opens]
-    if any(not green.isdisjoint(beside) and green.isdisjoint(motor) for green in stages):
-        return "it has a stage for trams or bicycles alone, whom no detector sees"
     ever = frozenset[int]().union(*(phase.green for phase in programme.phases))
-    amid = ever.intersection(motor).difference(*stages)
+    amid = ever.intersection(motor).difference(*(programme.phases[index].green for index in programme.opens))
     return f"signal {min(amid)} has green amid clearances only" if amid else ""

@@ -129,7 +129,7 @@ def read(
 def _why_left_alone(signal: Signal) -> str:
     if not signal.approaches:
         return "no motor traffic passes it"
-    return programmes.why_left_alone(signal.programme, signal.used_letters, signal.of_motors, signal.beside_motors)
+    return programmes.why_left_alone(signal.programme, signal.used_letters, signal.of_motors)
 
 
 def _sharing_approaches(signals: Sequence[Signal]) -> dict[str, str]:
@@ -212,6 +212,8 @@ class _Reader:
             second = signal.second()
             bare = signal.programme.without_yellow(signal.of_vehicles)
             programme = signal.programme.yielding(second).cleared(bare)
+            too_soon = programme.too_soon(signal.conflicts)
+            programme = programme.waiting(too_soon)
             signal_turns = self._signal_turns(signal, turn_index)
             first = len(stages)
             walked = set(range(signal.letters)) - signal.of_vehicles
@@ -227,6 +229,7 @@ class _Reader:
                     without_yellow=tuple(sorted(walked)),
                     made_to_yield=tuple(sorted({letter for letter, _ in second})),
                     given_yellow=tuple(sorted(bare)),
+                    kept_waiting=tuple(sorted({letter for _, letter in too_soon})),
                     callers=signal.callers,
                 )
             )
