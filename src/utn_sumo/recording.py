@@ -55,7 +55,7 @@ def new_folder(path: Path | None, default_name: str, flag: str = "--out") -> Pat
     Raises ResultError if the named folder holds anything, since nothing is ever overwritten, or can't be written to.
     """
     if path is None:
-        return _numbered(Path("results"), default_name)
+        return _numbered(Path("results"), default_name.replace(",", "-"))
     for sign, taken in ((":", "a colon, which SUMO takes for host:port"), (",", "a comma, which SUMO parts lists at")):
         if sign in str(path):
             raise ResultError(f"output folder {str(path)!r} has {taken}: name another")

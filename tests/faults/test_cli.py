@@ -276,6 +276,7 @@ def trips(file: Path) -> list[dict[str, str]]:
         (("mismatch", "--demand", "1,1.0000001", "--out", "new"), ["'1,1.0000001'", "each number once"]),
         (("mismatch", "--horizon", "9" * 5000, "--out", "new"), ["'horizon'", "a whole number"]),
         (("run", "--net", "", "--out", "new"), ["net ''"]),
+        (("run", "--net", "a,b.net.xml", "--out", "new"), ["'a,b.net.xml'", "a comma", "rename it"]),
         (("run", "--scenario", "deep.toml", "--out", "new"), ["'deep.toml'", "name a TOML file"]),
         (("run", "--scenario", "long.toml", "--out", "new"), ["'long.toml'", "name a TOML file"]),
         (("run", "--set", "horizon=" + "9" * 5000, "--out", "new"), ["'horizon'"]),
@@ -293,6 +294,7 @@ def test_what_cannot_be_is_said_before_anything_is_run(
         (folder / name).mkdir()
         (folder / name / "settings.json").write_text(content, encoding="utf-8")
     (folder / "routes.xml").write_text("<routes/>", encoding="utf-8")
+    (folder / "a,b.net.xml").write_text("<net/>", encoding="utf-8")
     (folder / "deep.toml").write_text("net = " + 5000 * "[", encoding="utf-8")
     (folder / "long.toml").write_text("seed = " + 5000 * "9", encoding="utf-8")
     line = one_line(refused(*arguments))

@@ -70,6 +70,8 @@ def load(
     if not path.is_file():
         known = did_you_mean(name, utn_network.names())
         raise NetworkError(f"net {name!r}: neither a shipped net nor a file; {known}")
+    if "," in str(path.resolve()):
+        raise NetworkError(f"net {name!r} lies under a name with a comma, which SUMO parts lists at: rename it")
     return read(path, stem(path), left_alone, additional, traffic, usual_green_s=usual_green_s)
 
 
