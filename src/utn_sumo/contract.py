@@ -155,7 +155,7 @@ class Caller:
     buttons: tuple[tuple[str, str], ...] = ()
     """Walking area and crossing, SUMO's edges: in the one a button stands for who wants to go over the other."""
     lanes: tuple[str, ...] = ()
-    """Lanes for bicycles or trams alone that end at the stop line."""
+    """Lanes for bicycles or trams alone that end at the stop line, or lead to one on which nobody can stand."""
 
 
 @dataclass(frozen=True)
@@ -788,7 +788,7 @@ class View(Protocol):
 
     @property
     def calling(self) -> Floats:
-        """(C,) of each caller how many of its buttons are pressed, and on how many of its lanes somebody is close."""
+        """(C,) of each caller how many of its buttons are pressed, and how many are close on its lanes."""
         ...
 
     def zone_veh(self, junctions: Bools) -> tuple[Floats, Floats]:

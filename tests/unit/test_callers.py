@@ -118,6 +118,37 @@ def test_a_main_road_in_full_flow_is_not_stopped_for_one_who_has_just_pressed_a_
     assert Scheduled(network).wish(busy).tolist() == [first]
 
 
+def test_who_is_counted_on_a_lane_of_his_own_weighs_as_a_vehicle_whatever_ways_lead_from_it(
+    street_of: StreetOf,
+) -> None:
+    network = street_of(odd_nets.bicycle_lanes)
+    lane = network.callers[0][1].lanes[0]
+    seen = np.array([3.0 * (lane in each.lanes) for _, each in network.callers])
+    assert (seen > 0).sum() > 1
+    streams = Streams(network)
+    calling = Calling(network, streams, Sides(network, streams, 2))
+    nobody = np.zeros(len(streams.link))
+    joined = calling.join(
+        seen, np.zeros(0), np.zeros(len(network.junctions)), nobody, nobody[:, None], nobody, nobody, nobody, nobody
+    )
+    assert joined[0].sum() == pytest.approx(3)
+
+
+def test_trams_call_from_inside_the_node_before_a_lane_on_which_none_can_stand(street_of: StreetOf) -> None:
+    def short(folder: Path) -> Path:
+        drawn = odd_nets.row("A")
+        for name, y in (("p", 15), ("TN", 150), ("TS", -150)):
+            drawn.node(name, 30, y)
+        drawn.one_way("TN", "p", allow="tram")
+        drawn.one_way("p", "A", allow="tram", length=0.3)
+        drawn.one_way("A", "TS", allow="tram")
+        return drawn.net(folder, odd_nets.NO_TURNAROUNDS)
+
+    called = [each.lanes for _, each in street_of(short).callers if "p-A_0" in each.lanes]
+    assert called
+    assert all(any(lane.startswith(":p_") for lane in lanes) for lanes in called)
+
+
 @pytest.mark.parametrize(
     "make", [odd_nets.pedestrians, odd_nets.tram_stage, odd_nets.crossing_amid_a_street, odd_nets.side_streets]
 )
@@ -141,4 +172,4 @@ def test_streams_of_motor_traffic_keep_their_places_and_their_greens(street_of: 
     joined = calling.join(pressed, waiting, np.full(len(network.junctions), 5.0), stand, come, worth, ends, kept, most)
     for whole, part in zip(joined, (stand, come, worth, ends, kept, most), strict=True):
         assert (whole[calling.motors] == part).all()
-    assert joined[0].sum() == pytest.approx(stand.sum() + pressed.sum() + waiting.sum())
+    assert joined[0].sum() == pytest.approx(stand.sum() + calling.weight_veh @ pressed + waiting.sum())

@@ -1,10 +1,12 @@
 """Who calls for green himself, as streams after those of a junction's motor traffic: people, bicycles, trams.
 
-As long as a button is pressed somebody stands there; how many is not known. All go as soon as they have green. Who
-waits on side roads (`sides`) comes after these.
+As long as a button is pressed somebody stands there; how many is not known. Bicycles and trams on lanes of theirs are
+counted. All go as soon as they have green. Who waits on side roads (`sides`) comes after these.
 """
 
 from __future__ import annotations
+
+from collections import Counter
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from utn_sumo.compiling import compiled
 from utn_sumo.contract import Floats, Ints, Network
 
 PRESSED_VEH = 0.5
-"""What a pressed button weighs, or a lane with somebody close to the stop line."""
+"""What a pressed button weighs."""
 ALL = 1e4
 """So many go in a bin of green: all."""
 
@@ -37,6 +39,11 @@ class Calling:
         ]
         self._stream, junctions, letters = np.array(found, dtype=np.int64).reshape(-1, 3).T
         """(C,) stream of each caller, counted from the first that is a caller's."""
+        # A lane is that of several letters, one for each way from it.
+        shared = Counter(lane for _, each in network.callers for lane in each.lanes)
+        ways = [max((shared[lane] for lane in each.lanes), default=0) for _, each in network.callers]
+        self.weight_veh = np.array([1 / count if count else PRESSED_VEH for count in ways])
+        """(C,) what a pressed button of his weighs, or who is close on his lanes."""
         one = np.unique(self._stream, return_index=True)[1]
         of_motors = np.repeat(np.arange(len(network.junctions)), np.diff(streams.first))
         junction = np.concatenate([of_motors, junctions[one], sides.junction])
@@ -71,13 +78,13 @@ class Calling:
     ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
         """`stand`, `come`, `worth`, `ends`, `kept` and `most` of all streams, by those of motor traffic.
 
-        And by how many buttons of each caller are pressed, `calling` (C,), and how many are `waiting` (E,) on side
-        roads; who is left at the end of a schedule stays there for so many bins, `staying` (J,).
+        And by how many call, `calling` (C,), as contract.View has them, and how many are `waiting` (E,) on side roads;
+        who is left at the end of a schedule stays there for so many bins, `staying` (J,).
         """
         if not self._is_joined:
             return stand, come, worth, ends, kept, most
         joined: tuple[Floats, Floats, Floats, Floats, Floats, Floats] = _joined(
-            *self._places, *self._junctions, self._stream, self._most, calling, waiting, staying,
+            *self._places, *self._junctions, self._stream, self._most, calling * self.weight_veh, waiting, staying,
             stand, come, worth, ends, kept, most,
         )  # fmt: skip
         return joined
@@ -96,11 +103,11 @@ def _joined(
         all_stand[place], all_come[place] = stand[own], come[own]
         all_worth[place], all_most[place] = worth[own], most[own]
         all_ends[place], all_kept[place] = ends[own], kept[own]
-    for caller, pressed in enumerate(calling):
-        all_stand[called[stream[caller]]] += pressed
+    for caller, calling_veh in enumerate(calling):
+        all_stand[called[stream[caller]]] += calling_veh
     for own, place in enumerate(called):
-        all_worth[place], all_most[place] = PRESSED_VEH, ALL
-        all_ends[place] = all_kept[place] = PRESSED_VEH * staying[called_at[own]]
+        all_worth[place], all_most[place] = 1.0, ALL
+        all_ends[place] = all_kept[place] = staying[called_at[own]]
     # A side road's weigh as before an empty road: how full theirs is, nothing says.
     for own, place in enumerate(beside):
         all_stand[place], all_worth[place], all_most[place] = waiting[own], 1.0, beside_most[own]

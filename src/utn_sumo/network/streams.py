@@ -13,7 +13,7 @@ from typing import Any
 from utn_sumo.contract import Caller
 from utn_sumo.errors import NetworkError
 from utn_sumo.network.programmes import Programme
-from utn_sumo.network.roads import STRAIGHT, for_motors
+from utn_sumo.network.roads import STANDS_M, STRAIGHT, for_motors
 from utn_sumo.xml_files import opened
 
 
@@ -46,7 +46,7 @@ class Signal:
                 buttons.setdefault(letter, set()).update((area, crossing.id) for area in crossing.areas)
         lanes: dict[int, set[str]] = {}
         for connection, letter in self.connections:
-            lanes.setdefault(letter, set()).add(str(connection.getFromLane().getID()))
+            lanes.setdefault(letter, set()).update(_stood_on(connection.getFromLane()))
         return tuple(
             Caller(letter, tuple(sorted(buttons.get(letter, ()))), tuple(sorted(lanes.get(letter, ()))))
             for letter in sorted((buttons.keys() | self.beside_motors) - self.of_motors)
@@ -142,6 +142,15 @@ class Crossing:
     """SUMO's edge."""
     areas: tuple[str, ...]
     """Walking areas at its ends, SUMO's edges."""
+
+
+def _stood_on(lane: Any) -> set[str]:
+    """A lane, and before one so short that nobody stands on it those inside the node that lead onto it."""
+    if lane.getLength() > STANDS_M:
+        return {str(lane.getID())}
+    onto = (each for connections in lane.getEdge().getIncoming().values() for each in connections)
+    inside = {str(each.getViaLaneID()) for each in onto if each.getToLane() is lane and each.getViaLaneID()}
+    return {str(lane.getID()), *inside}
 
 
 def _letters(connection: Any) -> tuple[int, ...]:

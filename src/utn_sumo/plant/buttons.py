@@ -32,7 +32,7 @@ class Buttons:
         """Wall time so far in reading them."""
 
     def read(self) -> Floats:
-        """(C,) of each caller how many buttons are pressed, and on how many lanes somebody is close."""
+        """(C,) of each caller how many buttons are pressed, and how many are close on its lanes."""
         called = np.zeros(self._callers)
         if not self._callers:
             return called
@@ -41,6 +41,6 @@ class Buttons:
         for number, area, crossing in self._buttons:
             called[number] += crossing in wanted[area]
         for number, name in self._detectors:
-            called[number] += self._present(name) > 0
+            called[number] += self._present(name)
         self.sumo_time_s += time.perf_counter() - started
         return called

@@ -321,7 +321,7 @@ class Sight:
 
     @cached_property
     def calling(self) -> Floats:
-        """(C,) of each caller how many of its buttons are pressed, and on how many of its lanes somebody is close."""
+        """(C,) of each caller how many of its buttons are pressed, and how many are close on its lanes."""
         return self._eyes.calling()
 
     @property
