@@ -100,6 +100,18 @@ def test_there_is_a_plan_for_every_hard_case(net: Network, cost: str, coordinati
         assert_admissible(net, mpc.plan(*HARD[case](net, np.random.default_rng(seed), HORIZON)))
 
 
+@pytest.mark.parametrize("coordination", ["admm", "sensitivity", "none"])
+def test_there_is_a_plan_where_the_least_greens_of_a_junction_fill_its_cycle(utn17: Network, coordination: str) -> None:
+    for shares in ([1 / 3, 1 / 3, 1 / 3], [0.2, 0.3, 0.5]):
+        least_s = utn17.min_green_s.copy()
+        least_s[list(utn17.junctions[0].stages)] = utn17.green_budget_s[0] * np.array(shares)
+        stages = zip(utn17.stages, least_s.tolist(), strict=True)
+        full = replace(utn17, stages=tuple(replace(stage, min_green_s=own) for stage, own in stages))
+        mpc = DistributedMPC(full, coordination=coordination)
+        for case in HARD.values():
+            assert_admissible(full, mpc.plan(*case(full, np.random.default_rng(1), HORIZON)))
+
+
 def test_at_the_default_stop_plans_are_within_a_thousandth_of_the_best(utn17: Network, cost: str) -> None:
     for seed in range(10):
         rng = np.random.default_rng([seed, 4])

@@ -18,6 +18,8 @@ OPTIMAL = (1, 2)
 PATIENCE = 1000
 """Steps without progress until DAQP says that it goes round in circles. Where nobody is on the road many rows meet in
 one point, and its own 10 are too few."""
+NO_SLACK_S = 1e-9
+"""Between bounds as near as this the solver sees an equality."""
 NOWHERE = -1
 """Of a variable that is no part of any shared flow."""
 
@@ -48,6 +50,7 @@ class Agent:
         chosen = self.shared.copy()
         chosen[self._given] = NOWHERE
         self._gram = gram(chosen)
+        self._implied = self._implied_rows()
         self.program: QuadraticProgram | None = None
         self.solution: Floats = np.zeros(self.problem.layout.size)
         self.residual = 0.0
@@ -60,6 +63,7 @@ class Agent:
         and the constraint matrix, and the solver starts from the last active set.
         """
         self.program = self.receding.programs(state, forecast).only
+        self.program.lower[self._implied], self.program.upper[self._implied] = -np.inf, np.inf
         self.load(rho)
 
     def forget(self) -> None:
@@ -88,6 +92,16 @@ class Agent:
         if flag < 0:
             raise ControllerError(f"agent {self.place.part.name}: the solver refused its problem (flag {flag})")
         self._rho, self._solver = rho, solver
+
+    def _implied_rows(self) -> Ints:
+        """The budgets where least greens fill the cycle. To bounds that meet they add nothing but an equality that
+        depends on others, which the solver refuses.
+        """
+        part, settings = self.place.part, self.problem.settings
+        is_open = part.green_budget_s[0] - part.min_green_s.sum() > NO_SLACK_S
+        budgets = 0 if is_open or settings.constraints == "dropped" else settings.control_horizon
+        # They come first among the rows (Statement._predict).
+        return self.problem.layout.size + np.arange(budgets)
 
     def _program(self) -> QuadraticProgram:
         if self.program is None:
