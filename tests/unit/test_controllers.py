@@ -111,6 +111,18 @@ def test_a_bad_setting_of_the_distributed_mpc_is_named_with_its_value(utn17: Net
     assert f"setting {name!r} is {value!r}: it must be" in line
 
 
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+@pytest.mark.parametrize(
+    ("controller", "name"),
+    [("max_wave", "every_s"), ("priced", "horizon_s"), ("priced", "crowding"), ("priced", "full"), ("tuc", "r")],
+)
+def test_a_setting_that_is_not_finite_is_named_with_its_value(
+    utn17: Network, controller: str, name: str, value: float
+) -> None:
+    line = complaint(utn17, controller, SettingError, **{name: value})
+    assert f"setting {name!r} is {value}: it must be" in line
+
+
 def test_a_control_horizon_beyond_the_horizon_is_refused(utn17: Network) -> None:
     line = complaint(utn17, "dmpc", SettingError, horizon=3, control_horizon=5)
     assert "control_horizon 5" in line
