@@ -15,6 +15,17 @@ MOST_VEH = 5000.0
 source queue, and several times as much, since for one who makes room those behind him go too who turn elsewhere."""
 MOST = 1e6
 """Of weights: beside more the other terms have no digits left."""
+COUNTS_WITH: dict[str, tuple[str, tuple[str, ...]]] = {
+    "q": ("cost", ("paper",)),
+    "r": ("cost", ("paper",)),
+    "crowding": ("cost", ("tts",)),
+    "terminal": ("cost", ("tts",)),
+    "scheduler": ("agents", ("dask",)),
+    "iterations": ("coordination", ("admm", "sensitivity")),
+    "rho": ("coordination", ("admm", "sensitivity")),
+    "relaxation": ("coordination", ("admm",)),
+}
+"""Settings that count beside some values of another only. Beside the rest they would do nothing, and nobody be told."""
 
 
 class ProblemSettings(BaseModel):
@@ -56,6 +67,15 @@ class ProblemSettings(BaseModel):
         if self.control_horizon > self.horizon:
             message = f"control_horizon {self.control_horizon} is beyond horizon {self.horizon}: make it at most that"
             raise ValueError(message)
+        return self
+
+    @model_validator(mode="after")
+    def _what_is_set_counts(self) -> Self:
+        for name, (other, values) in COUNTS_WITH.items():
+            if name in self.model_fields_set and getattr(self, other) not in values:
+                needed = " or ".join(map(repr, values))
+                message = f"{name} does nothing where {other} is {getattr(self, other)!r}: leave it out, or set {other}"
+                raise ValueError(f"{message} to {needed}")
         return self
 
     @model_validator(mode="after")

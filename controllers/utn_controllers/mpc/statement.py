@@ -89,7 +89,9 @@ class Structure:
         step_s = settings.step_s or part.control_step_s
         substeps = round(part.control_step_s / step_s)
         return cls(
-            settings=ProblemSettings(**settings.model_dump(include=set(ProblemSettings.model_fields))),
+            settings=ProblemSettings(
+                **settings.model_dump(include=set(ProblemSettings.model_fields), exclude_unset=True)
+            ),
             step_s=step_s,
             substeps=substeps,
             lags=min(int(np.ceil(part.free_time_s.max() / step_s)), settings.horizon * substeps),
