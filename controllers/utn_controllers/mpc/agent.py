@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from utn_controllers.mpc.place import has_slack
 from utn_controllers.mpc.problem import QuadraticProgram
 from utn_controllers.mpc.receding import RecedingProblem
 from utn_sumo.contract import Floats, Forecast, Ints, State
@@ -18,8 +19,6 @@ OPTIMAL = (1, 2)
 PATIENCE = 1000
 """Steps without progress until DAQP says that it goes round in circles. Where nobody is on the road many rows meet in
 one point, and its own 10 are too few."""
-NO_SLACK_S = 1e-9
-"""Between bounds as near as this the solver sees an equality."""
 NOWHERE = -1
 """Of a variable that is no part of any shared flow."""
 
@@ -94,14 +93,11 @@ class Agent:
         self._rho, self._solver = rho, solver
 
     def _implied_rows(self) -> Ints:
-        """The budgets where least greens fill the cycle. To bounds that meet they add nothing but an equality that
-        depends on others, which the solver refuses.
-        """
-        part, settings = self.place.part, self.problem.settings
-        is_open = part.green_budget_s[0] - part.min_green_s.sum() > NO_SLACK_S
-        budgets = 0 if is_open or settings.constraints == "dropped" else settings.control_horizon
+        """The budgets of a junction without slack, with which the solver would refuse the problem."""
+        settings = self.problem.settings
+        implied = settings.constraints == "kept" and not has_slack(self.place.part)[0]
         # They come first among the rows (Statement._predict).
-        return self.problem.layout.size + np.arange(budgets)
+        return self.problem.layout.size + np.arange(settings.control_horizon if implied else 0)
 
     def _program(self) -> QuadraticProgram:
         if self.program is None:
