@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
 
+from utn_controllers.mpc.agent import PATIENCE
 from utn_controllers.mpc.central import CentralizedMPC, Convex
 from utn_controllers.mpc.distributed import DistributedMPC
 from utn_controllers.mpc.problem import QuadraticProgram, Timing
@@ -140,7 +141,11 @@ def by_active_sets(whole: WholeProblem, stated: Sequence[QuadraticProgram]) -> f
     upper, lower = (np.concatenate([numbers[x], numbers["b"], numbers[h]]) for x, h in (("x_u", "h_u"), ("x_l", "h_l")))
     sense = np.zeros(len(upper), dtype=np.int32)
     sense[upper == lower] = 5
-    _, least, flag, _ = daqp.solve(whole.hessian.toarray(), numbers["c"], rows, upper, lower, sense)
+    solver = daqp.Model()
+    # As agents do: on empty roads it takes many steps without progress.
+    solver.settings = {"cycle_tol": PATIENCE}
+    solver.setup(whole.hessian.toarray(), numbers["c"], rows, upper, lower, sense)
+    _, least, flag, _ = solver.solve()
     assert flag in (1, 2)
     return float(least + sum(program.constant for program in stated))
 

@@ -10,7 +10,7 @@ RHO = {"tts": 0.2, "paper": 0.6}
 """Penalties that need the fewest iterations, by cost, found on random states of `utn17`."""
 OVER_STORAGE = 20.0
 """Cost of a vehicle over storage for one step of `tts`: far above the 1 + horizon that holding it elsewhere costs."""
-MOST_VEH = 5000.0
+MOST_VEH = 3000.0
 """Under `paper` a vehicle over storage counts as one more among so many: the thousand of the paper's links or of a long
 source queue, and several times as much, since for one who makes room those behind him go too who turn elsewhere."""
 MOST = 1e6
