@@ -91,7 +91,7 @@ class _Best:
 class WaveSettings(BaseModel):
     """Settings of `max_wave`."""
 
-    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     every_s: float = Field(5.0, ge=1, le=60)
     """Time between two decisions [s]."""

@@ -48,7 +48,8 @@ def calibrate(network: Network, log: Log, step_s: float = STEP_S) -> dict[str, A
     """Fit `network` to the runs of the log and return the calibration as it goes into its file.
 
     `step_s` is the model's step with which it is fitted; the parameters suit that step best.
-    `one_step_rmse_veh` is the error that is left in each of the runs, in their order.
+    `one_step_rmse_veh` is the error that is left in each of the runs, in their order. Standard errors take the model's
+    to be of their usual size at least: of links on which nobody drove they say as little as was known before.
     """
     from scipy.optimize import least_squares  # noqa: PLC0415 - heavy
 
@@ -83,7 +84,8 @@ def calibrate(network: Network, log: Log, step_s: float = STEP_S) -> dict[str, A
         max_nfev=EVALUATIONS,
     )
     error = fit.fun[: len(first) * log.x_veh[0].size].reshape(-1, *log.x_veh.shape[1:]) * usual_veh[0]
-    scale = 2 * fit.cost / max(len(fit.fun) - len(fit.x), 1)
+    # Residuals are in units of their usual size. Smaller ones, as of empty roads, are no measure of the parameters.
+    scale = max(2 * fit.cost / max(len(fit.fun) - len(fit.x), 1), 1.0)
     sd = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * scale)
     content = _content(_scaled(with_turns, fit.x), fit.x, sd, fraction_sd)
     for index in np.flatnonzero(np.isfinite(entry)):

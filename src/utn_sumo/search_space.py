@@ -119,7 +119,7 @@ class Space:
 
 def space(controller: str, over: Sequence[str] = (), execution: str | None = None) -> Space:
     """Where the settings of a controller are searched: those named in `over`, else all numbers that have both bounds,
-    or where there are none all choices.
+    or where there are none all choices; of these none that is refused beside the others' defaults.
 
     A setting is named as `name=low:high`, as `name=value,value,...`, or alone, for its own range or choices; those of
     an execution likewise, as `execution.name`. Raises UtnError.
@@ -137,7 +137,7 @@ def space(controller: str, over: Sequence[str] = (), execution: str | None = Non
             f"{whose} has no settings that say what they may be: give its class `Settings`, a pydantic model"
         )
     if not over:
-        own = {name: _own(each) for name, each in fields.items()}
+        own = {name: _own(each) for name, each in fields.items() if _counts(models, name, each)}
         ranges: dict[str, Range | Choice] = {name: each for name, each in own.items() if isinstance(each, Range)}
         bounded = ranges or {name: each for name, each in own.items() if each is not None}
         if not bounded:
@@ -176,6 +176,12 @@ def kind_of(field: FieldInfo) -> Any:
     """The type of a setting, None aside."""
     kinds = [each for each in get_args(field.annotation) if each is not type(None)]
     return kinds[0] if len(kinds) == 1 and get_origin(field.annotation) is not Literal else field.annotation
+
+
+def _counts(models: Mapping[str, type[BaseModel]], name: str, field: FieldInfo) -> bool:
+    """Whether a setting may be set while the others are at their defaults."""
+    alone = Space(models, {})
+    return alone.refusal({name: field.get_default()}) == alone.refusal({})
 
 
 def _own(field: FieldInfo) -> Range | Choice | None:

@@ -49,6 +49,18 @@ def test_every_value_has_a_positive_standard_error(fitted: tuple[Network, dict[s
         assert sum(share for share, _ in values["turns"].values()) == pytest.approx(1)
 
 
+def test_where_nobody_drove_standard_errors_are_as_wide_as_what_was_known_before(utn17: Network) -> None:
+    driven = simulated(utn17, 1)
+    names = (field.name for field in fields(driven) if field.name not in ("fraction", "green_s"))
+    empty = replace(driven, **{name: 0 * getattr(driven, name) for name in names})
+    content = calibration.calibrate(utn17, empty)
+    for values in content["links"].values():
+        for name, spread in calibration.FITTED.items():
+            value, error = values[name]
+            assert error / value > 0.9 * spread
+    assert content["startup_lag_s"][1] == pytest.approx(calibration.LAG_PRIOR_S, rel=0.1)
+
+
 def test_the_file_gives_the_network_its_values(
     utn17: Network, fitted: tuple[Network, dict[str, object]], tmp_path: Path
 ) -> None:

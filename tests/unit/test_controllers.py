@@ -111,6 +111,39 @@ def test_a_bad_setting_of_the_distributed_mpc_is_named_with_its_value(utn17: Net
     assert f"setting {name!r} is {value!r}: it must be" in line
 
 
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+@pytest.mark.parametrize(
+    ("controller", "name"),
+    [("max_wave", "every_s"), ("priced", "horizon_s"), ("priced", "crowding"), ("priced", "full"), ("tuc", "r")],
+)
+def test_a_setting_that_is_not_finite_is_named_with_its_value(
+    utn17: Network, controller: str, name: str, value: float
+) -> None:
+    line = complaint(utn17, controller, SettingError, **{name: value})
+    assert f"setting {name!r} is {value}: it must be" in line
+
+
+@pytest.mark.parametrize(
+    ("controller", "settings", "remedy"),
+    [
+        ("dmpc", {"q": 5.0}, "set cost to 'paper'"),
+        ("cmpc", {"r": 5.0}, "set cost to 'paper'"),
+        ("cmpc", {"crowding": 50.0, "cost": "paper"}, "set cost to 'tts'"),
+        ("dmpc", {"terminal": 50.0, "cost": "paper"}, "set cost to 'tts'"),
+        ("dmpc", {"scheduler": "tcp://nowhere:1"}, "set agents to 'dask'"),
+        ("dmpc", {"iterations": 9, "coordination": "none"}, "set coordination to 'admm' or 'sensitivity'"),
+        ("dmpc", {"rho": 9.0, "coordination": "none"}, "set coordination to 'admm' or 'sensitivity'"),
+        ("dmpc", {"relaxation": 1.0, "coordination": "sensitivity"}, "set coordination to 'admm'"),
+    ],
+)
+def test_a_setting_that_would_do_nothing_is_refused(
+    utn17: Network, controller: str, settings: dict[str, Any], remedy: str
+) -> None:
+    line = complaint(utn17, controller, SettingError, **settings)
+    assert f"{next(iter(settings))} does nothing where " in line
+    assert f"leave it out, or {remedy}" in line
+
+
 def test_a_control_horizon_beyond_the_horizon_is_refused(utn17: Network) -> None:
     line = complaint(utn17, "dmpc", SettingError, horizon=3, control_horizon=5)
     assert "control_horizon 5" in line

@@ -100,6 +100,18 @@ def test_there_is_a_plan_for_every_hard_case(net: Network, cost: str, coordinati
         assert_admissible(net, mpc.plan(*HARD[case](net, np.random.default_rng(seed), HORIZON)))
 
 
+@pytest.mark.parametrize("coordination", ["admm", "sensitivity", "none"])
+def test_there_is_a_plan_where_the_least_greens_of_a_junction_fill_its_cycle(utn17: Network, coordination: str) -> None:
+    for shares in ([1 / 3, 1 / 3, 1 / 3], [0.2, 0.3, 0.5]):
+        least_s = utn17.min_green_s.copy()
+        least_s[list(utn17.junctions[0].stages)] = utn17.green_budget_s[0] * np.array(shares)
+        stages = zip(utn17.stages, least_s.tolist(), strict=True)
+        full = replace(utn17, stages=tuple(replace(stage, min_green_s=own) for stage, own in stages))
+        mpc = DistributedMPC(full, coordination=coordination)
+        for case in HARD.values():
+            assert_admissible(full, mpc.plan(*case(full, np.random.default_rng(1), HORIZON)))
+
+
 def test_at_the_default_stop_plans_are_within_a_thousandth_of_the_best(utn17: Network, cost: str) -> None:
     for seed in range(10):
         rng = np.random.default_rng([seed, 4])
@@ -208,9 +220,14 @@ def test_a_finer_model_step_saves_as_much_time_as_the_whole_cycle_at_least(utn17
     assert finer <= whole < 0.95 * split
 
 
+def free_greens(cost: str) -> dict[str, Any]:
+    """Settings of a cost by which greens as such hardly cost anything."""
+    return {"cost": cost} if cost == "tts" else {"cost": cost, "r": 1e-4}
+
+
 def test_the_longer_queue_gets_the_longer_green(utn17: Network, cost: str) -> None:
     q = np.where(utn17.turn_link == utn17.link_index("6"), 90.0, 0.0) * utn17.fraction
-    mpc = DistributedMPC(utn17, cost=cost, r=1e-4)
+    mpc = DistributedMPC(utn17, **free_greens(cost))
     green = mpc.plan(quiet_state(utn17, q=q), Forecast(np.zeros((HORIZON, 17)))).green_s
     junction = utn17.junctions[2]
     assert green[junction.stages[0]] > green[junction.stages[1]]
@@ -222,7 +239,7 @@ def test_green_goes_where_the_turning_fractions_let_traffic_out(utn17: Network, 
     leaves = utn17.turn_next == EXIT
     x = np.zeros(17)
     x[[utn17.link_index(link) for link in ("4", "6", "7")]] = utn17.storage_veh[3], 80.0, 80.0
-    mpc = DistributedMPC(utn17, cost=cost, r=1e-4, horizon=2)
+    mpc = DistributedMPC(utn17, horizon=2, **free_greens(cost))
     longer = []
     for out, blocked in ((from_6, from_7), (from_7, from_6)):
         fraction = np.where(out, np.where(leaves, 0.95, 0.05), utn17.fraction)

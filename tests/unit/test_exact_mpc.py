@@ -214,6 +214,18 @@ def test_an_answer_that_the_solver_does_not_vouch_for_is_none(utn17: Network, mo
         hasty.solve(*some_case(utn17, 0), equal_greens(utn17, 2))
 
 
+def test_where_least_greens_fill_every_cycle_these_are_the_plan_and_nobody_is_warned(
+    utn17: Network, capfd: pytest.CaptureFixture[str]
+) -> None:
+    equal_s = utn17.equal_split().green_s
+    stages = tuple(replace(each, min_green_s=own) for each, own in zip(utn17.stages, equal_s.tolist(), strict=True))
+    fixed = ExactProblem(replace(utn17, stages=stages), settings_of("tts", horizon=2))
+    for seed in range(3):
+        found = fixed.solve(*some_case(utn17, seed, 2), equal_greens(utn17, 2))
+        assert found.greens_s == pytest.approx(np.tile(equal_s, (2, 1)))
+    assert capfd.readouterr() == ("", "")
+
+
 def test_greens_that_fit_no_cycle_are_an_error_in_one_line(utn17: Network) -> None:
     # Three stages of 40 s and more in a cycle that leaves 105 s.
     stages = tuple(replace(each, min_green_s=40.0) if each.junction == 0 else each for each in utn17.stages)

@@ -439,6 +439,28 @@ def test_the_orders_are_found_again(criterion: Any) -> None:
     assert found.table[criterion].is_monotonic_increasing
 
 
+def test_fits_of_wandering_series_are_told_from_maxima_and_how_to_make_them_some() -> None:
+    walk = np.cumsum(np.random.default_rng(0).normal(0, 2, (240, 4)), axis=0)
+    others = (np.ones((4, 4)) - np.eye(4)) / 3
+    with pytest.warns(ConvergenceWarning, match=r'the series wander .*\(trend="c"\) or difference them'):
+        results = STARIMA(walk, (1, 0, 0), (1, 0), [others]).fit()
+    # As likely as any model of a walk whose variance is known, and no more.
+    assert results.llf == pytest.approx(STARIMA(walk, (0, 1, 0)).fit().llf, abs=50)
+    assert np.isfinite(results.get_forecast(3).conf_int()).all()
+    with pytest.warns(ConvergenceWarning, match="the series wander"):
+        found = select_order(walk, [others], max_order=(1, 0, 0))
+    assert found.table["converged"][0]
+    assert not found.table["converged"].is_monotonic_increasing
+    assert found.table["converged"].is_monotonic_decreasing
+    for converged in (True, False):
+        assert found.table["aic"][found.table["converged"] == converged].is_monotonic_increasing
+
+
+def test_a_root_as_good_as_one_is_refused() -> None:
+    with pytest.raises(SettingError, match=r"not stationary .*largest root 0\.9999999"):
+        STARIMA(np.zeros((9, 1)), (1, 0, 0)).update([1 - 1e-7, 1.0])
+
+
 # Unhappy askings
 
 ROWS = np.random.default_rng(15).normal(size=(30, 3))

@@ -105,6 +105,15 @@ def test_without_a_word_all_numbers_with_both_bounds_are_searched() -> None:
     assert "'gap_s' is 0" in str(both.refusal({"execution.gap_s": 0.0}))
 
 
+def test_settings_that_do_nothing_beside_the_defaults_are_searched_only_where_they_are_named() -> None:
+    searched = space("cmpc").searched
+    assert {"crowding", "terminal"} <= set(searched)
+    assert not {"q", "r"} & set(searched)
+    named = space("cmpc", ("q=0.01:1", "cost"))
+    assert named.refusal({"q": 0.5, "cost": "paper"}) is None
+    assert "q does nothing where cost is 'tts'" in str(named.refusal({"q": 0.5, "cost": "tts"}))
+
+
 def test_where_no_number_has_both_bounds_all_choices_are_searched() -> None:
     assert space("cyclic_max_pressure").searched == {
         "count": Choice(("queue", "vehicles")),

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from utn_controllers.mpc.place import has_slack
 from utn_controllers.mpc.problem import QuadraticProgram
 from utn_controllers.mpc.receding import RecedingProblem
 from utn_sumo.contract import Floats, Forecast, Ints, State
@@ -48,6 +49,7 @@ class Agent:
         chosen = self.shared.copy()
         chosen[self._given] = NOWHERE
         self._gram = gram(chosen)
+        self._implied = self._implied_rows()
         self.program: QuadraticProgram | None = None
         self.solution: Floats = np.zeros(self.problem.layout.size)
         self.residual = 0.0
@@ -60,6 +62,7 @@ class Agent:
         and the constraint matrix, and the solver starts from the last active set.
         """
         self.program = self.receding.programs(state, forecast).only
+        self.program.lower[self._implied], self.program.upper[self._implied] = -np.inf, np.inf
         self.load(rho)
 
     def forget(self) -> None:
@@ -88,6 +91,13 @@ class Agent:
         if flag < 0:
             raise ControllerError(f"agent {self.place.part.name}: the solver refused its problem (flag {flag})")
         self._rho, self._solver = rho, solver
+
+    def _implied_rows(self) -> Ints:
+        """The budgets of a junction without slack, with which the solver would refuse the problem."""
+        settings = self.problem.settings
+        implied = settings.constraints == "kept" and not has_slack(self.place.part)[0]
+        # They come first among the rows (Statement._predict).
+        return self.problem.layout.size + np.arange(settings.control_horizon if implied else 0)
 
     def _program(self) -> QuadraticProgram:
         if self.program is None:

@@ -83,6 +83,10 @@ class Batch:
         if not self._scale.size:
             self._scale = self._equilibrate(programs, rho)
         columns, rows = np.split(self._scale, [size])
+        if self.problem.settings.cost == "paper" and not self._y.any():
+            # Begin with nobody over storage: from none its multipliers take too many calls up to so high a price.
+            over = self.problem.layout.over_storage.ravel()
+            self._y[:, over] = -(programs.gradient[0, over] * columns[over])[:, None]
         equality = (programs.lower == programs.upper).all(axis=0)
         self._penalty = np.where(equality, PENALTY * EQUALITY_FACTOR, PENALTY)
         by_bound = np.concatenate([1 / columns, rows])

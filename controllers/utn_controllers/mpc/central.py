@@ -67,6 +67,7 @@ class Convex:
 
     def __init__(self, network: Network, settings: CentralSettings):
         self._control_horizon, self._stages = settings.control_horizon, len(network.stages)
+        self._scale = settings.scale
         self.receding = [RecedingProblem(place, settings) for place in places(network)]
         self.whole = WholeProblem([each.problem for each in self.receding], tolerance=settings.tolerance)
 
@@ -79,7 +80,7 @@ class Convex:
         greens = np.zeros((self._control_horizon, self._stages))
         for each, solution in zip(self.receding, solutions, strict=True):
             greens[:, each.place.stages] = each.settle(solution)
-        return greens, {"cost": cost, "solver_iterations": self.whole.iterations}
+        return greens, {"cost": cost / self._scale, "solver_iterations": self.whole.iterations}
 
 
 class Exact:

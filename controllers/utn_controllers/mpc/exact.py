@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from utn_controllers.mpc.place import remaining_steps
+from utn_controllers.mpc.place import has_slack, remaining_steps
 from utn_controllers.mpc.settings import ProblemSettings
 from utn_sumo.contract import Floats, Forecast, Network, State
 from utn_sumo.errors import ControllerError
@@ -80,7 +80,7 @@ class ExactProblem:
         rounding, scale = ca.SX.sym("rounding", 2), ca.SX.sym("scale")
         model = LinkModel(network, self._model.step_s, SmoothOperations(rounding[0], rounding[1]))
         states, variables, rows = self._predict(model, start, greens, (demand, disturbance), fraction)
-        budgets = ca.vec(ca.mtimes(ca.DM(self._by_junction), greens))
+        budgets = ca.vec(ca.mtimes(ca.DM(self._by_junction[has_slack(network)]), greens))
         # In the order in which `_solve_once` fills them in.
         known = [
             start.x_veh,
@@ -188,7 +188,7 @@ class ExactProblem:
         net, kept = self.network, self.settings.control_horizon
         least, others = net.min_green_s, self._by_junction.T @ self._by_junction @ net.min_green_s - net.min_green_s
         free = np.full(variables - kept * len(least), np.inf)
-        rows = np.concatenate([np.zeros(equations), np.tile(net.green_budget_s, kept)])
+        rows = np.concatenate([np.zeros(equations), np.tile(net.green_budget_s[has_slack(net)], kept)])
         return {
             "lbx": np.concatenate([np.tile(least, kept), -free]),
             "ubx": np.concatenate([np.tile(net.green_budget_s[net.stage_junction] - others, kept), free]),

@@ -9,10 +9,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from utn_sumo.contract import EXIT, Floats, Ints, Network
+from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
 
 MOST_LINKS = 1000
 """Of a way through the network: where nobody ever leaves it, as in a net without exits, it would have no end."""
+NO_SLACK_S = 1e-9
+"""Between bounds as near as this a solver sees an equality."""
 PRODUCER, CONSUMER = 0, 1
 """What a junction is to a link: it feeds it, or has it for one of its own."""
 
@@ -77,6 +79,15 @@ def places(network: Network, groups: Iterable[Sequence[int]] | None = None) -> l
         part = network.part(*group)
         found.append(Place(part, links, turns, stages, network.turn_next[turns], remaining[links]))
     return found
+
+
+def has_slack(network: Network) -> Bools:
+    """(J,) junctions whose least greens leave something of the cycle.
+
+    At the others the greens' bounds meet. A budget beside them says nothing new, and is one equality too many.
+    """
+    least_s = np.bincount(network.stage_junction, network.min_green_s, len(network.junctions))
+    return np.asarray(network.green_budget_s - least_s > NO_SLACK_S)
 
 
 def remaining_steps(network: Network) -> Floats:

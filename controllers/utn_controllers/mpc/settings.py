@@ -8,10 +8,24 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 RHO = {"tts": 0.2, "paper": 0.6}
 """Penalties that need the fewest iterations, by cost, found on random states of `utn17`."""
-
-
+OVER_STORAGE = 20.0
+"""Cost of a vehicle over storage for one step of `tts`: far above the 1 + horizon that holding it elsewhere costs."""
+MOST_VEH = 3000.0
+"""Under `paper` a vehicle over storage counts as one more among so many: the thousand of the paper's links or of a long
+source queue, and several times as much, since for one who makes room those behind him go too who turn elsewhere."""
 MOST = 1e6
-"""Of weights: with more a solver has no digits left for anything else."""
+"""Of weights: beside more the other terms have no digits left."""
+COUNTS_WITH: dict[str, tuple[str, tuple[str, ...]]] = {
+    "q": ("cost", ("paper",)),
+    "r": ("cost", ("paper",)),
+    "crowding": ("cost", ("tts",)),
+    "terminal": ("cost", ("tts",)),
+    "scheduler": ("agents", ("dask",)),
+    "iterations": ("coordination", ("admm", "sensitivity")),
+    "rho": ("coordination", ("admm", "sensitivity")),
+    "relaxation": ("coordination", ("admm",)),
+}
+"""Settings that count beside some values of another only. Beside the rest they would do nothing, and nobody be told."""
 
 
 class ProblemSettings(BaseModel):
@@ -55,6 +69,40 @@ class ProblemSettings(BaseModel):
             raise ValueError(message)
         return self
 
+    @model_validator(mode="after")
+    def _what_is_set_counts(self) -> Self:
+        for name, (other, values) in COUNTS_WITH.items():
+            if name in self.model_fields_set and getattr(self, other) not in values:
+                needed = " or ".join(map(repr, values))
+                message = f"{name} does nothing where {other} is {getattr(self, other)!r}: leave it out, or set {other}"
+                raise ValueError(f"{message} to {needed}")
+        return self
+
+    @model_validator(mode="after")
+    def _something_costs(self) -> Self:
+        if self.cost == "paper" and self.q == self.r == 0:
+            message = "q and r are both 0, and any plan costs the same by the paper's cost: give one of them a weight"
+            raise ValueError(message)
+        return self
+
+    @property
+    def scale(self) -> float:
+        """What the convex problem's cost is multiplied by, so that no weight of it is above 1: beside larger ones a
+        solver has no digits left for the flows, whose own weight is small.
+        """
+        weights = (self.q, self.r) if self.cost == "paper" else (self.crowding, self.terminal)
+        return 1 / max(1.0, *weights)
+
+    def over_storage_cost(self, steps: int) -> float:
+        """Scaled cost of a vehicle over storage for one of so many model steps: an exact penalty (SPEC 3).
+
+        It must be above what that saves elsewhere until the horizon's end. With `paper` that is 2 q x a step: there it
+        grows with the horizon and with how many are held.
+        """
+        if self.cost == "paper":
+            return max(OVER_STORAGE, 2 * self.scale * self.q * MOST_VEH * steps)
+        return OVER_STORAGE
+
     def stage_cost(self, x: Any, waiting: Any, storage_veh: Any) -> Any:
         """Cost of one predicted control step with `x` and the source queues `waiting` (Z,), symbols or numbers."""
         import casadi as ca  # noqa: PLC0415 - heavy
@@ -72,11 +120,11 @@ class ProblemSettings(BaseModel):
         return self.terminal * (ca.dot(remaining, x) + ca.dot(remaining, waiting))
 
     def price(self, remaining: Any) -> Any:
-        """What a vehicle more on a link is likely to cost, before anything is agreed; `remaining` (Z,) as above.
+        """What a vehicle more on a link is likely to cost (scaled) before anything is agreed; `remaining` (Z,) steps.
 
         On a free road a vehicle costs the steps that it still needs.
         """
-        return remaining if self.cost == "tts" else 0.0 * remaining
+        return self.scale * remaining if self.cost == "tts" else 0.0 * remaining
 
     def green_cost(self, green: Any) -> Any:
         """Cost of one step's greens."""
@@ -101,7 +149,7 @@ class Settings(ProblemSettings):
     iterations: int = Field(60, ge=1, le=1000)
     """Most iterations in a control step."""
     rho: float | None = Field(None, gt=0, le=MOST)
-    """First penalty; by default what suits the cost."""
+    """First penalty, beside a cost whose weights are 1 at most; by default what suits the cost."""
     relaxation: float = Field(1.6, gt=0, lt=2)
     """How far an iteration goes beyond what the agents have agreed on."""
     tolerance_abs: float = Field(0.02, gt=0)

@@ -5,8 +5,9 @@ delays, at what the last plan predicted, and where in the cycle the green stands
 network's problem is the sum of these problems under `inflow of a link as its consumer has it = outflow to it as its
 producer has it`, which is what the agents coordinate.
 
-Everything is in veh per model step and, for the cost, veh times control steps. Junctions of the same structure share
-one CasADi function: Hessian and constraint pattern are found once, the loop then only evaluates numbers.
+Everything is in veh per model step and, for the cost, veh times control steps, times `ProblemSettings.scale`.
+Junctions of the same structure share one CasADi function: Hessian and constraint pattern are found once, the loop then
+only evaluates numbers.
 """
 
 from __future__ import annotations
@@ -24,8 +25,6 @@ from utn_sumo.model import CasadiOperations, LinkModel, LinkNumbers
 
 REGULARISATION = 1e-3
 """Weight of the squared flows: makes the Hessian definite and the plan unique; 1e-3 veh a step at 1 veh."""
-STORAGE_PENALTY = 20.0
-"""Cost of a vehicle over storage for one step. Exact: far above the 1 + horizon that holding it elsewhere costs."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,9 @@ class Structure:
         step_s = settings.step_s or part.control_step_s
         substeps = round(part.control_step_s / step_s)
         return cls(
-            settings=ProblemSettings(**settings.model_dump(include=set(ProblemSettings.model_fields))),
+            settings=ProblemSettings(
+                **settings.model_dump(include=set(ProblemSettings.model_fields), exclude_unset=True)
+            ),
             step_s=step_s,
             substeps=substeps,
             lags=min(int(np.ceil(part.free_time_s.max() / step_s)), settings.horizon * substeps),
@@ -206,6 +207,7 @@ class Statement:
         structure, layout = self.structure, self.layout
         settings, lags = structure.settings, structure.lags + 1
         kept = settings.constraints == "kept"
+        scale, over_storage = settings.scale, settings.over_storage_cost(structure.steps)
         numbers = LinkNumbers(saturation, storage, room_share)
         model = LinkModel(structure.example, structure.step_s, CasadiOperations(), numbers)
         source = np.array(structure.is_source, dtype=float)
@@ -239,11 +241,11 @@ class Statement:
             x = x + inflow - model.by_link(leaving)
             waiting = waiting + source * (demand[step] - inflow)
             rows += [(waiting[int(link)], 0.0, np.inf) for link in np.flatnonzero(source)]
-            part_of_step = settings.stage_cost(x, waiting, storage) + STORAGE_PENALTY * ca.sum1(over)
+            part_of_step = scale * settings.stage_cost(x, waiting, storage) + over_storage * ca.sum1(over)
             cost += part_of_step / structure.substeps
             cost += REGULARISATION / 2 * (ca.sumsqr(leaving) + ca.sumsqr(inflow) + ca.sumsqr(over))
-        cost += sum(settings.green_cost(z[green]) for green in layout.green)
-        return cost + settings.terminal_cost(x, waiting, remaining), rows
+        cost += scale * sum(settings.green_cost(z[green]) for green in layout.green)
+        return cost + scale * settings.terminal_cost(x, waiting, remaining), rows
 
 
 @cache

@@ -25,7 +25,8 @@ class OrderSelection:
     spatial: tuple[int, int]
     """Its spatial orders (m, n)."""
     table: pd.DataFrame
-    """A row per model: order, spatial, the number of parameters, the log-likelihood, the criterion; the best first."""
+    """A row per model: order, spatial, the number of parameters, whether its fit `converged`, the log-likelihood, the
+    criterion; the best first, after those that converged the others."""
 
 
 def select_order(
@@ -41,7 +42,8 @@ def select_order(
     """Fit every STARIMA with p, q and spatial orders up to the given ones, with max_order's d, and rank them.
 
     `method` is that of `STARIMA.fit`; the criterion always takes the exact likelihood of what it finds. `settings` are
-    STARIMA's own: trend, seasonal_diff, ... The BIC counts rows of `endog`, as statsmodels does, not single values.
+    STARIMA's own: trend, seasonal_diff, ... What has no maximum of the likelihood comes last, with a warning. The
+    BIC counts rows of `endog`, as statsmodels does, not single values.
     """
     if criterion not in CRITERIA:
         raise SettingError(f"criterion: {criterion!r} is unknown; {did_you_mean(criterion, CRITERIA)}")
@@ -53,11 +55,12 @@ def select_order(
                 "order": order,
                 "spatial": spatial,
                 "parameters": len(results.params),
+                "converged": bool(results.mle_retvals["converged"]),
                 "llf": float(results.llf),
                 criterion: float(results.info_criteria(criterion)),
             }
         )
-    table = pd.DataFrame(rows).sort_values(criterion, kind="stable", ignore_index=True)
+    table = pd.DataFrame(rows).sort_values(["converged", criterion], ascending=[False, True], ignore_index=True)
     return OrderSelection(table["order"][0], table["spatial"][0], table)
 
 

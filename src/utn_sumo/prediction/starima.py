@@ -28,6 +28,10 @@ from utn_sumo.prediction.weights import Weights, checked
 
 METHODS = ("exact", "conditional")
 MOST_STATES = 3000
+LARGEST_ROOT = 1 - 1e-6
+"""Of the autoregression: nearer to 1 the stationary variance has no digits left, nor has the likelihood."""
+EDGE = 1e-3
+"""Below the largest root a search that has found no maximum was on its way to it."""
 SHRINK, SHRINKINGS = 0.9, 100
 """Of the coefficients of a first guess, until it is admissible."""
 STEP = 1e-3
@@ -239,9 +243,9 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         variance = self.form.variance_of(params)
         if not (variance > 0).all():
             raise SettingError(f"STARIMA: a variance sigma2 of {variance.min():g} is not positive; give one above 0")
-        if self.enforce_stationarity and (root := self.form.ar_root(params)) >= 1:
+        if self.enforce_stationarity and (root := self.form.ar_root(params)) > LARGEST_ROOT:
             raise SettingError(
-                f"STARIMA: the AR coefficients are not stationary (largest root {root:.4g}, it must be below 1);"
+                f"STARIMA: the AR coefficients are not stationary (largest root {root:.7g}, it must be below 1);"
                 " difference the series, lower p, or set enforce_stationarity=False"
             )
         if self.enforce_invertibility and (root := self.form.ma_root(params)) >= 1:
@@ -275,14 +279,13 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         found = self._conditional_maximum(start_params, maxiter)
         if method == "exact":
             found = self._exact_maximum(found.params, maxiter)
+        params = self.handle_params(found.params)
         if not found.converged:
             warnings.warn(
-                f"STARIMA: no maximum of the likelihood after {found.iterations} iterations;"
-                " lower the order or raise maxiter",
+                f"STARIMA: no maximum of the likelihood after {found.iterations} iterations; {self._remedy(params)}",
                 ConvergenceWarning,
                 stacklevel=2,
             )
-        params = self.handle_params(found.params)
         if cov_type is None:
             cov_type, cov_kwds = (
                 "custom",
@@ -296,6 +299,14 @@ class STARIMA(MLEModel):  # type: ignore[misc]  # statsmodels ships no types
         results.mle_retvals = {"converged": found.converged, "iterations": found.iterations, "fopt": found.value}
         results.mle_settings = {"method": method, "maxiter": maxiter}
         return results
+
+    def _remedy(self, params: Floats) -> str:
+        """What to do about a search that ended at these parameters and at no maximum."""
+        root = self.form.ar_root(params)
+        if not self.enforce_stationarity or root < LARGEST_ROOT - EDGE:
+            return "lower the order or raise maxiter"
+        mean = "" if self.form.mean else 'give the series their level (trend="c") or '
+        return f"the series wander (largest AR root {root:.7g}): {mean}difference them"
 
     @property
     def _free(self) -> Any:
