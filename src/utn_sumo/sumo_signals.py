@@ -27,7 +27,8 @@ class Peer(BaseModel, ABC):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     min_green_s: int = Field(5, ge=1, le=120)
-    """Least green of a stage for which the net names none (`minDur`): netconvert's `tls.min-dur`."""
+    """Least green of a stage for which the net names none (`minDur`): netconvert's `tls.min-dur`. SUMO's own
+    actuation has it no longer than the programme shows the stage."""
 
     @abstractmethod
     def programmes(self, network: Network, chosen: Case) -> tuple[Network, list[ET.Element]]:
