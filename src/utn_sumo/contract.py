@@ -188,6 +188,11 @@ class Junction:
         return tuple(letter for letter, (turns, conflicts) in letters if not turns and any(conflicts))
 
     @property
+    def is_mended(self) -> bool:
+        """Whether its stages and clearances are not quite those of the net's own programme."""
+        return bool(self.made_to_yield or self.given_yellow or self.kept_waiting)
+
+    @property
     def is_walked(self) -> bool:
         """Whether people walk here."""
         return len(self.crossings) > 0

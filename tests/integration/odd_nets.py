@@ -734,7 +734,7 @@ def yellow_forgotten(folder: Path) -> Path:
         *((20, NORTH_SOUTH), (3, "GGgrrryyyrrr"), (12, "GGgrrrrrrrrr"), (2, DARK)),
         *((20, EAST_WEST), (3, "rrryyyrrryyy"), (2, DARK)),
     )
-    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", phases))
+    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", phases, offset=40))
     return case(folder, traffic("C"))
 
 
@@ -744,7 +744,7 @@ def green_too_soon(folder: Path) -> Path:
         *((25, NORTH_SOUTH), (2, "yyyrrryyyrrr"), (1, "yyyGGgyyyGGg"), (20, EAST_WEST)),
         *((3, "rrryyyrrryyy"), (2, DARK)),
     )
-    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", phases))
+    retime(row("C").net(folder, NO_TURNAROUNDS), tl_logic("C", phases, offset=40))
     return case(folder, traffic("C"))
 
 

@@ -350,12 +350,15 @@ class SumoPlant:
     def _lead_in(self, plan: Plan) -> None:
         """Until a junction's first cycle begins show the end of one, where SUMO by itself would not be at its end then.
 
-        It is with programmes of fixed times, not with those whose greens SUMO ends as it thinks best.
+        It is with programmes of fixed times, not with those whose greens SUMO ends as it thinks best. Nor may it show
+        what is mended.
         """
         lights = self._sumo.trafficlight
         for index, (junction, until_s) in enumerate(zip(self.network.junctions, self._boundary_s, strict=True)):
+            if until_s == 0:
+                continue
             types = {logic.programID: logic.type for logic in lights.getAllProgramLogics(junction.id)}
-            if until_s == 0 or types[lights.getProgram(junction.id)] == STATIC:
+            if types[lights.getProgram(junction.id)] == STATIC and not junction.is_mended:
                 continue
             self._hand_over(index, plan.green_s)
             durations_s = [seconds for _, seconds in cycle_phases(self.network, index, plan.green_s)]
