@@ -4,6 +4,9 @@ A stage is a phase that shows green and no yellow. What follows it up to the nex
 net and never optimised: yellow, all-red, red and yellow, and short remnants of the green before, such as the seconds
 in which the pedestrians of a crossing have red already and the cars beside them still have green. A phase under five
 seconds is a stage only if nobody else lets go whom it does.
+
+What is unsafe in a programme is mended where it can be: who gives way (`yielding`), yellow (`cleared`), greens that begin
+too soon (`waiting`).
 """
 
 from __future__ import annotations
@@ -24,6 +27,8 @@ SHORT_GREEN_S = 5.0
 """The same where greens end by what is to be seen: netconvert's `tls.min-dur`, which SUMO's own signals keep."""
 SHORTEST_STAGE_S = 5.0
 GREEN, YELLOW, OFF = "Gg", "yYu", "oO"
+CLEARING = "yY"
+"""Yellow after a green; red and yellow (u) comes before one."""
 SWITCHED_OFF = "its programme switches signals off (o, O)"
 
 
@@ -128,8 +133,8 @@ class Programme:
     def _clears(self, index: int, letter: int) -> bool:
         """Whether a phase has a letter's yellow after a green that had way."""
         shown = [self.phases[index - back].state[letter] for back in range(len(self.phases))]
-        before = next((each for each in shown if each not in "yY"), "")
-        return shown[0] in "yY" and before == "G"
+        before = next((each for each in shown if each not in CLEARING), "")
+        return shown[0] in CLEARING and before == "G"
 
     def without_yellow(self, letters: Collection[int]) -> set[int]:
         """Of these letters those whose green ends in red at once, though the programme knows yellow."""
@@ -159,7 +164,9 @@ class Programme:
     @property
     def _yellow_s(self) -> float:
         """The longest yellow that any letter has in one phase."""
-        return max((phase.duration_s for phase in self.phases if set(phase.state) & set("yY")), default=0.0)
+        return max(
+            (phase.duration_s for phase in self.phases if not set(phase.state).isdisjoint(CLEARING)), default=0.0
+        )
 
     def _ending(self, letters: Collection[int]) -> Iterator[tuple[Phase, set[int]]]:
         """Each phase, and which of the letters have green in it and red at once after it."""
