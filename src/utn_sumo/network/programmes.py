@@ -5,8 +5,8 @@ net and never optimised: yellow, all-red, red and yellow, and short remnants of 
 in which the pedestrians of a crossing have red already and the cars beside them still have green. A phase under five
 seconds is a stage only if nobody else lets go whom it does.
 
-What is unsafe in a programme is mended where it can be: who gives way (`yielding`), yellow (`cleared`), greens that begin
-too soon (`waiting`).
+What is unsafe in a programme is mended where it can be: who gives way (`yielding`), yellow (`cleared`), greens that
+begin too soon (`waiting`).
 """
 
 from __future__ import annotations
