@@ -122,6 +122,8 @@ class Turn:
     """Number of the lane of the link's last edge that each of these begins at."""
     group: int
     """Lane group that its traffic queues in."""
+    crossing_m: float = 0.0
+    """How far it is across the junction for who gives way, from where he waits amid it or before it."""
 
 
 @dataclass(frozen=True)
@@ -301,6 +303,18 @@ class Network:
         for junction in self.junctions:
             free[[turn for turns in junction.signal_turns for turn in turns]] = False
         return free
+
+    @cached_property
+    def never_green(self) -> Mapping[str, tuple[int, ...]]:
+        """Letters of motor traffic that no phase of their junction's programme opens, by its id: nobody goes there."""
+        found = {}
+        for junction in self.junctions:
+            stages = [self.stages[stage] for stage in junction.stages]
+            shown = [state for stage in stages for state in (stage.state, *(each for each, _ in stage.clearance))]
+            letters = [letter for letter, turns in enumerate(junction.signal_turns) if turns]
+            if closed := tuple(each for each in letters if not any(state[each] in "Gg" for state in shown)):
+                found[junction.id] = closed
+        return found
 
     @cached_property
     def within(self) -> Bools:

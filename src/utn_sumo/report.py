@@ -101,6 +101,10 @@ def table(result: dict[str, Any]) -> None:
         console.print(_window(brought), highlight=False)
     for reason in [*result.get("unsafe_reasons", []), *result.get("fallback_reasons", [])]:
         console.print(f"  ! {reason}")
+    for junction, letters in result.get("never_green", {}).items():
+        console.print(
+            f"  ! {junction}: signal {', '.join(map(str, letters))} has no green in its programme: nobody goes there"
+        )
     if not result["arrived"] + result["unfinished"]:
         console.print("  ! nobody departed: no vehicle of the routes departs in this window, give another one")
     if result["left_out_veh"]:
@@ -229,12 +233,13 @@ def mismatch_table(results: list[dict[str, Any]], folder: Path) -> None:
 def _controlled(junction: dict[str, Any]) -> str:
     if junction["refused"]:
         return f"no: {junction['refused']}"
-    mended = {
+    notes = {
         "made_to_yield": "gives way to who has green with it",
         "given_yellow": "is given the yellow that it lacks",
         "kept_waiting": "waits until others are cleared",
+        "never_green": "has no green in its programme: nobody goes there",
     }
-    said = [f"signal {', '.join(map(str, junction[key]))} {how}" for key, how in mended.items() if junction[key]]
+    said = [f"signal {', '.join(map(str, junction[key]))} {how}" for key, how in notes.items() if junction[key]]
     return ", ".join(["yes", *said])
 
 

@@ -95,6 +95,26 @@ def test_who_drives_straight_across_another_road_is_not_made_to_give_way(street_
     assert "are both green" in signals.refused(net)["C"]
 
 
+def main_road_turning(folder: Path) -> Path:
+    """The main road turns right from the west to the south, where the north's traffic joins it."""
+    drawn = row("C", priority=1)
+    for edge in drawn.parts["edges"]:
+        if edge.get("id") in ("W-C", "C-sC"):
+            edge.set("priority", "9")
+    phases = [(30, "GGgrrrrrrGrr"), (3, "yyyrrrrrryrr"), (30, "rrrGGgrrrrrr"), (3, "rrryyyrrrrrr"), (2, DARK)]
+    return retime(drawn.net(folder, NO_TURNAROUNDS), tl_logic("C", phases))
+
+
+def test_who_joins_a_main_road_that_has_green_with_him_gives_way_though_he_drives_straight_on(
+    street_of: StreetOf,
+) -> None:
+    net = street_of(main_road_turning)
+    joins, main = NORTH + AHEAD, WEST + RIGHT
+    assert frozenset((joins, main)) in conflicting(net)
+    assert joins in net.junctions[0].made_to_yield
+    assert main not in net.junctions[0].made_to_yield
+
+
 def narrowing(folder: Path) -> Path:
     """Two lanes from the west lead ahead into one, each with a letter of its own."""
     drawn = row("C").without("W-C")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sumolib
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
@@ -20,11 +21,12 @@ from utn_controllers.scheduled.gaps import AMID_VEH, GAP_S, HEADWAY_S, Gaps, Giv
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
 from utn_sumo.contract import Network
+from utn_sumo.network import load
 from utn_sumo.network.lanes import lane_sets, unevenness
 
 Make = Callable[[Path], Any]
 StreetOf = Callable[[Make], Network]
-BINS = 12
+BINS, BIN_S = 12, 2.0
 
 
 def queues(
@@ -35,6 +37,7 @@ def queues(
     beside: bool = False,
     shut: bool = False,
     flowing: float = 1.0,
+    gap_s: float = GAP_S,
 ) -> list[float]:
     """What is left in each bin of a green of ten vehicles that give way to a queue and to who comes towards them.
 
@@ -50,7 +53,8 @@ def queues(
         np.array([[shut, False]]),
         np.ones((1, 2)),
         np.ones((1, 2)),
-        2.0,
+        np.full((1, 2), gap_s),
+        BIN_S,
     )
     veh, come = np.array([10.0, towards_veh]), np.zeros((2, BINS))
     come[1] = come_veh
@@ -110,12 +114,12 @@ def test_who_waits_does_so_until_the_first_gap_that_lasts(rate_veh_s: float) -> 
         while (gap_s := rng.exponential(1 / rate_veh_s)) < GAP_S:
             waited_s += gap_s
         waits_s.append(waited_s)
-    assert headways(rate_veh_s * GAP_S) * HEADWAY_S == pytest.approx(np.mean(waits_s), rel=0.1)
+    assert headways(rate_veh_s * GAP_S, GAP_S) * HEADWAY_S == pytest.approx(np.mean(waits_s), rel=0.1)
 
 
 def test_nobody_waits_without_oncoming_traffic_and_for_ever_where_it_never_ends() -> None:
-    assert headways(0.0) == 0
-    assert headways(1e3) == np.inf
+    assert headways(0.0, GAP_S) == 0
+    assert headways(1e3, GAP_S) == np.inf
 
 
 @given(pace=st.floats(0.0, 1.0), to_come=st.floats(0.0, 1.0), queued_veh=st.floats(0.0, 9.0), lanes=st.integers(1, 3))
@@ -124,7 +128,7 @@ def test_two_of_a_lane_that_stands_for_a_gap_go_as_its_green_ends_and_none_of_on
 ) -> None:
     gaps = Gaps(
         np.array([[0.3, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.full((1, 2), 2.0), np.array([True]),
-        *np.zeros((2, 1, 2), dtype=bool), np.ones((1, 2)), np.ones((1, 2)), 2.0,
+        *np.zeros((2, 1, 2), dtype=bool), np.ones((1, 2)), np.ones((1, 2)), np.full((1, 2), GAP_S), BIN_S,
     )  # fmt: skip
     veh, amid, going = np.array([queued_veh, 5.0]), np.ones(2), np.array([[0, 1, -1]])
     clear(0, veh, np.full(2, float(lanes)), going, gaps, np.array([pace, 0.0]), np.array([to_come, 1.0]), amid)
@@ -156,6 +160,46 @@ def test_left_turns_without_a_stage_of_their_own_wait_for_who_comes_straight_on(
                 foes = gaps.foes[row, stream - first]
                 assert all(streams.link[first + foe] != streams.link[stream] for foe in foes[foes >= 0])
     assert gaps.some.any()
+
+
+@given(share=st.floats(0.1, 1.0), come=st.floats(0.05, 0.5), gap_s=st.floats(4.0, 9.0), beside=st.booleans())
+def test_the_farther_it_is_across_the_junction_the_fewer_find_a_gap(
+    share: float, come: float, gap_s: float, beside: bool
+) -> None:
+    near, far = (queues(share, 3.0, come, beside=beside, gap_s=each) for each in (gap_s, gap_s + 1))
+    assert all(a <= b + 1e-9 for a, b in zip(near, far, strict=True))
+    assert near[-1] < far[-1] or far[-1] == pytest.approx(0.0, abs=1e-6)
+
+
+def across(radius_m: int) -> Make:
+    """A crossroads whose corners are so round."""
+
+    def make(folder: Path) -> Path:
+        streets = odd_nets.row("C")
+        streets.parts["nodes"][0].set("radius", str(radius_m))
+        return streets.net(folder, odd_nets.NO_TURNAROUNDS)
+
+    return make
+
+
+def test_who_has_farther_to_go_across_the_junction_needs_a_longer_gap(tmp_path: Path) -> None:
+    gaps_s = []
+    for radius_m in (4, 20):
+        (folder := tmp_path / str(radius_m)).mkdir()
+        file = across(radius_m)(folder)
+        gaps = Scheduled(network := load(str(file)))._giving.gaps
+        # As far as from where left turns wait amid the junction to its end.
+        net = sumolib.net.readNet(str(file), withInternal=True)
+        for turn in network.turns:
+            lane = net.getLane(turn.via_lanes[0])
+            onward = [each.getViaLaneID() for each in lane.getOutgoing() if each.getViaLaneID()]
+            assert turn.crossing_m == pytest.approx(
+                sum(net.getLane(each).getLength() for each in onward or [lane.getID()])
+            )
+        (gap_s,) = set(gaps.gap_s[gaps.waiting > 0].round(6))
+        gaps_s.append(gap_s)
+    assert gaps_s[0] == GAP_S
+    assert gaps_s[1] > GAP_S + 1
 
 
 def test_nobody_waits_for_gaps_on_lanes_from_which_hardly_anybody_turns(street_of: StreetOf) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,24 @@ def test_every_link_and_junction_is_told_with_its_numbers(utn17: Network) -> Non
         "10": {"next_link": "10", "fraction": pytest.approx(0.7)},
         "W1": {"next_link": None, "fraction": pytest.approx(0.3)},
     }
+
+
+def test_who_never_has_green_is_told(utn17: Network) -> None:
+    """As in programmes of joined nodes that somebody edited by hand."""
+    first = utn17.junctions[0]
+    letter = first.signal_turns.index(next(turns for turns in first.signal_turns if turns))
+
+    def closed(state: str) -> str:
+        return f"{state[:letter]}r{state[letter + 1 :]}"
+
+    stages = [
+        replace(stage, state=closed(stage.state), clearance=tuple((closed(each), s) for each, s in stage.clearance))
+        if index in first.stages
+        else stage
+        for index, stage in enumerate(utn17.stages)
+    ]
+    found = inspection.inspect(replace(utn17, stages=tuple(stages)))["junctions"]
+    assert [each["never_green"] for each in found] == [[letter], *[[]] * 7]
 
 
 def test_the_command_prints_one_object_and_draws_a_map(tmp_path: Path) -> None:

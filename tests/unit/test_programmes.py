@@ -321,6 +321,19 @@ def test_a_green_that_ends_without_yellow_is_given_what_the_programme_has_elsewh
     assert mended.without_yellow({0, 1, 2, 3}) == set()
 
 
+def test_a_phase_as_long_as_the_yellow_is_all_of_it_for_who_had_green_before() -> None:
+    # Letter 2 goes on while 0 is cleared, and ends in red with that; 1, green in that phase alone, has no time for it.
+    given = programme((20, "GrGr"), (3, "yGGr"), (20, "rrrG"), (3, "rrry"))
+    mended = given.cleared(given.without_yellow({0, 1, 2, 3}))
+    assert [(phase.duration_s, phase.state) for phase in mended.phases] == [
+        (20, "GrGr"),
+        (3, "yGyr"),
+        (20, "rrrG"),
+        (3, "rrry"),
+    ]
+    assert mended.without_yellow({0, 1, 2, 3}) == {1}
+
+
 def test_who_needs_no_yellow_and_a_programme_that_knows_none_stay_as_they_are() -> None:
     given = programme(*FORGOTTEN)
     assert given.without_yellow({1, 2, 3}) == set()
@@ -330,7 +343,7 @@ def test_who_needs_no_yellow_and_a_programme_that_knows_none_stay_as_they_are() 
 
 
 def test_a_green_too_short_for_yellow_stays_as_it_is() -> None:
-    given = programme((20, "GGrr"), (3, "Gyrr"), (3, "Grrr"), (2, "rrrr"), *TWO_STAGES[3:])
+    given = programme((20, "GGrr"), (3, "Gyrr"), (2, "Grrr"), (2, "rrrr"), *TWO_STAGES[3:])
     assert given.cleared({0}) == given
 
 

@@ -133,6 +133,7 @@ class Crossing:
             np.zeros(shape, dtype=np.bool_),
             np.full(shape, self.flowing),
             np.full(shape, self.to_come),
+            np.full(shape, 4.0),
             2.0,
         )
         return Rules(

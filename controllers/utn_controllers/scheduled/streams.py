@@ -94,6 +94,11 @@ class Streams:
         self.letters = [tuple(sorted(each)) for each in own]
         """(N,) the letters of its junction that each has green by."""
 
+    @property
+    def way_turn(self) -> Ints:
+        """(V,) the turn of each way with a signal."""
+        return self._way_turn[self._signalled]
+
     def shares(self, fraction: Floats) -> Shares:
         """The shares of traffic by the turning fractions (M,): who has a choice of lanes takes the emptier ones."""
         sets = len(self._lanes)

@@ -145,15 +145,20 @@ class Programme:
     def cleared(self, letters: Collection[int]) -> Programme:
         """With yellow, as long as it has it elsewhere, at the end of these letters' greens that end in red at once.
 
-        A green that is too short for that stays as it is. The cycle is as long as before.
+        A phase as long as the yellow is all of it for who has green in the one before too. A green that is too short
+        for that stays as it is. The cycle is as long as before.
         """
         phases: list[Phase] = []
-        for phase, ending in self._ending(letters):
+        for index, (phase, bare) in enumerate(self._ending(letters)):
             left_s = phase.duration_s - self._yellow_s
-            if not ending or not self._yellow_s or left_s < 1:
+            ending = bare & self.phases[index - 1].green if left_s < 1 else bare
+            if not ending or not self._yellow_s or left_s < 0:
                 phases.append(phase)
                 continue
             state = "".join("y" if letter in ending else shown for letter, shown in enumerate(phase.state))
+            if left_s < 1:
+                phases.append(replace(phase, state=state))
+                continue
             least_s = None if phase.least_s is None else min(phase.least_s, left_s)
             phases += [
                 replace(phase, duration_s=left_s, least_s=least_s),

@@ -20,11 +20,11 @@ from utn_sumo.network.lanes import lane_groups, lane_sets
 from utn_sumo.network.programmes import MIN_GREEN_S, SHORT_GREEN_S, Block, Phase
 from utn_sumo.network.roads import (
     Chain,
+    Inside,
     Roads,
     for_motors,
     free_s,
     leads_on,
-    lengths_m,
     motor_lanes,
     reserved_lanes,
     usual_weight,
@@ -124,7 +124,7 @@ def read(
             alike.setdefault(reason, []).append(signal)
         reasons = "; ".join(f"{', '.join(own)}: {reason}" for reason, own in alike.items())
         raise NetworkError(f"net {str(path)!r} has no signals that can be controlled ({reasons})")
-    reader = _Reader(net, controlled, _read_fractions(path), traffic, usual_green_s)
+    reader = _Reader(net, controlled, _read_fractions(path), traffic, usual_green_s, inside=Inside.of(path))
     return reader.network(path.resolve(), name, left_alone)
 
 
@@ -184,8 +184,11 @@ class _Reader:
         fractions: Mapping[tuple[str, str], float],
         traffic: Traffic | None,
         usual_green_s: float,
+        *,
+        inside: Inside,
     ):
         self.net = net
+        self.inside = inside
         self.signals = signals
         self.fractions = fractions
         self.usual_green_s = usual_green_s
@@ -204,8 +207,7 @@ class _Reader:
     def network(self, path: Path, name: str, left_alone: Mapping[str, str]) -> Network:
         turns, groups, lanes_of = self._turns()
         fed = {turn.next_link for turn in turns}
-        inside_m = lengths_m(path, {lane for chain in self.chains for lane in chain.waiting})
-        links = tuple(self._link(chain, index in fed, inside_m) for index, chain in enumerate(self.chains))
+        links = tuple(self._link(chain, index in fed) for index, chain in enumerate(self.chains))
         turn_index = {(turn.link, turn.to_edge): index for index, turn in enumerate(turns)}
         stages: list[Stage] = []
         junctions: list[Junction] = []
@@ -257,7 +259,7 @@ class _Reader:
             side_roads=sides,
         )
 
-    def _link(self, chain: Chain, fed: bool, inside_m: Mapping[str, float]) -> Link:
+    def _link(self, chain: Chain, fed: bool) -> Link:
         edges = [self.net.getEdge(member) for member in chain.edges]
         lanes = [len(motor_lanes(edge)) for edge in edges]
         lane_m = sum(edge.getLength() * count for edge, count in zip(edges, lanes, strict=True))
@@ -278,7 +280,7 @@ class _Reader:
             joining=chain.joining,
             parting=chain.parting,
             parting_m=chain.parting_m,
-            waiting=tuple((lane, inside_m[lane]) for lane in chain.waiting),
+            waiting=tuple((lane, self.inside.length_m[lane]) for lane in chain.waiting),
         )
 
     def _turns(self) -> tuple[list[Turn], list[LaneGroup], list[tuple[int, ...]]]:
@@ -304,6 +306,7 @@ class _Reader:
                     fraction=share,
                     via_lanes=tuple(via for via, _ in inside[edge]),
                     from_lanes=tuple(lane for _, lane in inside[edge]),
+                    crossing_m=max(self.inside.crossing_m(via) for via, _ in inside[edge]),
                     group=group_of[edge.getID()],
                 )
                 for edge, share in zip(targets, shares, strict=True)

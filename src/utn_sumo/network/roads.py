@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from utn_sumo.xml_files import opened
 
@@ -52,19 +52,38 @@ def for_motors(connections: Iterable[Any]) -> list[Any]:
     return [each for each in connections if _admits_motors(each.getFromLane()) and _admits_motors(each.getToLane())]
 
 
-def lengths_m(path: Path, lanes: Collection[str]) -> dict[str, float]:
-    """Lengths of some lanes of a net file, by id, those inside nodes too, which sumolib leaves out here."""
-    from defusedxml import ElementTree  # noqa: PLC0415
+class Inside(NamedTuple):
+    """Lanes inside a net's nodes, which sumolib leaves out here."""
 
-    found: dict[str, float] = {}
-    if lanes:
+    length_m: Mapping[str, float]
+    """By lane."""
+    onward: Mapping[str, str]
+    """The lane that one leads onto who has waited at its end, amid the junction."""
+
+    @classmethod
+    def of(cls, path: Path) -> Inside:
+        """Those of a net file."""
+        from defusedxml import ElementTree  # noqa: PLC0415
+
+        length_m: dict[str, float] = {}
+        onward: dict[str, str] = {}
         with opened(path) as file:
             for _, element in ElementTree.iterparse(file, forbid_dtd=True):
-                if element.tag == "lane" and element.get("id") in lanes:
-                    found[element.get("id")] = float(element.get("length"))
+                if element.tag == "lane" and element.get("id").startswith(":"):
+                    length_m[element.get("id")] = float(element.get("length"))
+                if element.tag == "connection" and element.get("via") and element.get("from").startswith(":"):
+                    onward[f"{element.get('from')}_{element.get('fromLane')}"] = element.get("via")
                 if element.tag in ("junction", "connection", "edge", "tlLogic"):
                     element.clear()
-    return found
+        return cls(length_m, onward)
+
+    def crossing_m(self, lane: str) -> float:
+        """How far it is across the junction for who gives way on a lane, from where he waits."""
+        at = self.onward.get(lane, lane)
+        crossing_m = self.length_m[at]
+        while at := self.onward.get(at, ""):
+            crossing_m += self.length_m[at]
+        return crossing_m
 
 
 def leads_on(edge: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
@@ -89,25 +89,31 @@ class Signal:
         return tuple(tuple(row) for row in matrix)
 
     def second(self) -> set[tuple[int, int]]:
-        """Pairs of letters that conflict and have protected greens together, of which the first turns and gives way.
+        """Pairs of letters that conflict and have protected greens together, of which the first gives way.
 
-        By the net's right-of-way matrix. netconvert gives opposite left turns such a stage even where they meet, amid a
-        skew or wide junction.
+        By the net's right-of-way matrix. Some turn: netconvert gives opposite left turns such a stage even where they
+        meet, amid a skew or wide junction. Others join the second one's road, and meet nobody else who has way.
         """
         phases = self.programme.phases if self.programme else ()
-        return {
+        together = {
             (a, b)
             for a, b in permutations(range(self.letters), 2)
-            if self.conflicts[a][b]
-            and any(phase.state[a] == phase.state[b] == "G" for phase in phases)
-            and self._gives_way(a, b)
-            and not self._gives_way(b, a)
+            if self.conflicts[a][b] and any(phase.state[a] == phase.state[b] == "G" for phase in phases)
         }
+        turning, joining = (
+            {(a, b) for a, b in together if self._gives_way(a, b, how) and not self._gives_way(b, a, how)}
+            for how in (_turns, _joins)
+        )
+        settled = {pair for a, b in turning | joining for pair in ((a, b), (b, a))}
+        return turning | {(a, b) for a, b in joining if all(pair in settled for pair in together if pair[0] == a)}
 
-    def _gives_way(self, a: int, b: int) -> bool:
-        """Whether all of letter `a` whom anybody of letter `b` comes in the way of turn, and must give way to him."""
+    def _gives_way(self, a: int, b: int, how: Callable[[Any, Any], bool]) -> bool:
+        """Whether all of letter `a` whom anybody of letter `b` comes in the way of move so, and must give way to him.
+
+        `how` tells it of connections of the two.
+        """
         before = [
-            connection.getDirection() != STRAIGHT and node.forbids(other, connection)
+            how(connection, other) and node.forbids(other, connection)
             for connection, letter in self.connections
             for other, other_letter in self.connections
             if (letter, other_letter) == (a, b)
@@ -115,6 +121,14 @@ class Signal:
             and _are_foes(node, node.getLinkIndex(connection), node.getLinkIndex(other))
         ]
         return bool(before) and all(before)
+
+
+def _turns(connection: Any, _other: Any) -> bool:
+    return bool(connection.getDirection() != STRAIGHT)
+
+
+def _joins(connection: Any, other: Any) -> bool:
+    return connection.getTo() is other.getTo()
 
 
 def _are_foes(node: Any, one: int, other: int) -> bool:
