@@ -30,6 +30,7 @@ Where another stage of the junction has a lane set to itself, or people walk, yi
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -38,13 +39,15 @@ from utn_controllers.scheduled.standstill import ROOM, START_S, Shown
 from utn_controllers.scheduled.streams import Shares, Streams
 from utn_sumo.clearances import GIVES_WAY, HAS_WAY
 from utn_sumo.compiling import compiled, inlined
-from utn_sumo.contract import EXIT, Bools, Floats, Ints, Network
+from utn_sumo.contract import CAR_ACCELERATION_M_S2, EXIT, Bools, Floats, Ints, Network
 
 ALL = 0.95
 """Who discharges at so much of what he can has a queue."""
 GAP_S, GAP_CROSSING_M, GAP_S_M = 4.0, 14.0, 0.1
 """How long there must be nobody for who has so far to go across the junction or less, and for each metre more. In SUMO
 Adams' formula has left turns go as they do with 3.6 s and as much for each metre; schedules do best with less."""
+SLOWER = 0.5
+"""Of the time that who speeds up slowly takes more than a car to get across: so much longer is the gap in SUMO."""
 SEEN_S = 5.0
 """Over how much green it is seen whether a lane stands: of a queue that goes somebody leaves it every two seconds."""
 STANDING = 0.25
@@ -227,11 +230,13 @@ def _gap_s(network: Network, streams: Streams, waits: Bools, shape: tuple[int, .
     """As in Gaps, of the ways that are thought to wait (S, V): what the one needs that has farthest to go."""
     crossing_m = np.array([turn.crossing_m for turn in network.turns])[streams.way_turn]
     gap_s = np.full(shape, GAP_S)
+    slower = network.acceleration_m_s2**-0.5 - CAR_ACCELERATION_M_S2**-0.5
     for row, way in zip(*waits.nonzero(), strict=True):
         junction = network.stage_junction[streams.stage[row]]
         alike = streams.lane_set == streams.lane_set[streams.way_stream[way]]
         places = np.flatnonzero(alike) - streams.first[junction]
         needs_s = GAP_S + GAP_S_M * (crossing_m[way] - GAP_CROSSING_M)
+        needs_s += SLOWER * math.sqrt(2 * (crossing_m[way] + network.shortest_m)) * slower
         gap_s[row, places] = np.maximum(gap_s[row, places], needs_s)
     return gap_s
 
