@@ -80,7 +80,10 @@ class Scheduled:
         self._calling = Calling(network, self._streams, self._sides)
         alone = are_alone(network, self._streams)
         moves = Moves(network, self._calling, BIN_S, alone)
-        lost_bins = lost(self._streams.first_stage, moves.bins, np.asarray(self._streams.serves.any(axis=1)))
+        lost_bins, cleared_bins = (
+            lost(self._streams.first_stage, bins, np.asarray(self._streams.serves.any(axis=1)))
+            for bins in (moves.bins, moves.cleared_bins)
+        )
         apart = are_apart(network, self._streams, alone)
         ahead = ahead_bins(
             are_far(network, self._streams),
@@ -102,7 +105,7 @@ class Scheduled:
         self._standstill = Standstill(network, self._streams, self.settings.standstill_s)
         stages = self._streams.stage
         self._yielding = Yielding(network, self._streams, moves)
-        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, moves.held, lost_bins)
+        self._giving = Giving(network, self._streams, self._yielding.learnt, BIN_S, moves.held, cleared_bins)
         self._rules = Rules(
             stages,
             self._streams.first_stage,

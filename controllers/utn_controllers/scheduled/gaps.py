@@ -106,7 +106,7 @@ class Giving:
     def __init__(self, network: Network, streams: Streams, learnt: Bools, bin_s: float, held: Bools, lost_bins: Ints):
         """But for lane sets whose discharge in a stage is `learnt` (S, L). Who is `held`, as in Moves, goes on.
 
-        Of `lost_bins` (J,) the clearances of a cycle take.
+        Clearances take `lost_bins` (J,) of a cycle, without who starts slowly.
         """
         self._streams = streams
         self._waits = np.zeros((len(streams.stage), len(streams.way_stream)), dtype=np.bool_)

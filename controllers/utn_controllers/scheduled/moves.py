@@ -75,6 +75,8 @@ class Moves:
         """(S, most stages of a junction) where the clearance from a stage to its junction's nth begins, -1: all red."""
         self.bins = np.ones((len(owner), most), dtype=np.int64)
         """(S, most stages of a junction) its bins."""
+        self.cleared_bins = self.bins.copy()
+        """(S, most stages of a junction) those without who starts slowly."""
         for index, junction in enumerate(network.junctions):
             letters = streams.letters[streams.first[index] : streams.first[index + 1]]
             times = Times.of(network, junction)
@@ -85,6 +87,7 @@ class Moves:
                     if first != then:
                         phases = clearances.between(network, junction, times, first, then)
                         shares = _shares(phases, letters, bin_s)
+                        self.cleared_bins[row, place] = len(shares)
                         own = rows[streams.first_stage[index] + place]
                         shares = np.concatenate([shares, _starting(own, rows[row], late_bins)])
                         self.bins[row, place] = len(shares)
