@@ -20,6 +20,7 @@ from tests.integration import odd_nets
 from tests.integration.odd_nets import ARM_M, NO_TURNAROUNDS, TWO_STAGES, Streets, retime, row, tl_logic
 from utn_sumo import network
 from utn_sumo.contract import EXIT, Link, Network
+from utn_sumo.errors import NetworkError
 from utn_sumo.network import MOTOR, roads
 from utn_sumo.network.lanes import lane_groups
 from utn_sumo.sumo_tools import sumo_binary
@@ -367,3 +368,26 @@ def test_a_pocket_is_a_group_of_its_own_and_so_is_the_lane_beside_it(street_of: 
     assert net.group_saturation_flow_veh_s[list(set(group.values()))] == pytest.approx(
         net.saturation_flow_veh_s[index] / 2
     )
+
+
+@pytest.mark.parametrize("length", ["long", "nan", "-1", ""])
+def test_a_net_whose_lanes_inside_nodes_have_no_length_is_refused_in_one_line(length: str, tmp_path: Path) -> None:
+    tree = ET.parse(file := row("C").net(tmp_path, NO_TURNAROUNDS))
+    lane = next(each for each in tree.iter("lane") if each.get("id", "").startswith(":C"))
+    lane.set("length", length)
+    tree.write(file)
+    with pytest.raises(NetworkError, match=f"lane '{lane.get('id')}' is '{length}' m long: give a .net.xml") as refused:
+        network.load(str(file))
+    assert "\n" not in str(refused.value)
+
+
+def test_lanes_inside_a_node_that_lead_round_are_read_to_their_end(tmp_path: Path) -> None:
+    tree = ET.parse(file := row("C").net(tmp_path, NO_TURNAROUNDS))
+    amid = [each for each in tree.iter("connection") if each.get("from", "").startswith(":C") and each.get("via")]
+    for each in amid:
+        edge, lane = each.get("via", "").rsplit("_", 1)
+        back = {"from": edge, "fromLane": lane, "via": f"{each.get('from')}_{each.get('fromLane')}"}
+        tree.getroot().append(ET.Element("connection", {**each.attrib, **back}))
+    assert amid
+    tree.write(file)
+    assert all(0 < turn.crossing_m < 100 for turn in network.load(str(file)).turns)

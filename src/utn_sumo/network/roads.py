@@ -6,11 +6,13 @@ the main road out name each other; side roads at such a node bring traffic onto 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from utn_sumo.errors import NetworkError
 from utn_sumo.xml_files import opened
 
 MOTOR = (
@@ -69,9 +71,9 @@ class Inside(NamedTuple):
         onward: dict[str, str] = {}
         with opened(path) as file:
             for _, element in ElementTree.iterparse(file, forbid_dtd=True):
-                if element.tag == "lane" and element.get("id").startswith(":"):
-                    length_m[element.get("id")] = float(element.get("length"))
-                if element.tag == "connection" and element.get("via") and element.get("from").startswith(":"):
+                if element.tag == "lane" and element.get("id", "").startswith(":"):
+                    length_m[element.get("id")] = _length_m(path, element)
+                if element.tag == "connection" and element.get("via") and element.get("from", "").startswith(":"):
                     onward[f"{element.get('from')}_{element.get('fromLane')}"] = element.get("via")
                 if element.tag in ("junction", "connection", "edge", "tlLogic"):
                     element.clear()
@@ -79,11 +81,23 @@ class Inside(NamedTuple):
 
     def crossing_m(self, lane: str) -> float:
         """How far it is across the junction for who gives way on a lane, from where he waits."""
-        at = self.onward.get(lane, lane)
-        crossing_m = self.length_m[at]
-        while at := self.onward.get(at, ""):
-            crossing_m += self.length_m[at]
-        return crossing_m
+        lanes = [self.onward.get(lane, lane)]
+        while (after := self.onward.get(lanes[-1])) and after not in lanes:
+            lanes.append(after)
+        return sum(self.length_m.get(each, 0.0) for each in lanes)
+
+
+def _length_m(path: Path, lane: Any) -> float:
+    try:
+        length_m = float(lane.get("length", ""))
+    except ValueError:
+        length_m = math.nan
+    if not 0 <= length_m < math.inf:
+        raise NetworkError(
+            f"net {str(path)!r}: lane {lane.get('id')!r} is {lane.get('length')!r} m long: give a .net.xml written by "
+            "netconvert"
+        )
+    return length_m
 
 
 def leads_on(edge: Any) -> bool:
