@@ -158,7 +158,7 @@ def run(
         "bridge_time_s": elapsed_s - (plant.sumo_time_s - start_s) - tally.control_time_s - plant.decision_time_s,
         "interrupted": interrupted,
         "left_alone": dict(net.left_alone),
-        "never_green": {junction: list(letters) for junction, letters in net.never_green.items()},
+        "never_green": dict(net.never_green),
         "unsafe_reasons": verdict.reasons[:20],
         "fallback_reasons": [*tally.fallback_reasons, *plant.failures][:20],
         "out": str(folder),

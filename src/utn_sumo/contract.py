@@ -305,14 +305,14 @@ class Network:
         return free
 
     @cached_property
-    def never_green(self) -> Mapping[str, tuple[int, ...]]:
+    def never_green(self) -> Mapping[str, list[int]]:
         """Letters of motor traffic that no phase of their junction's programme opens, by its id: nobody goes there."""
         found = {}
         for junction in self.junctions:
             stages = [self.stages[stage] for stage in junction.stages]
             shown = [state for stage in stages for state in (stage.state, *(each for each, _ in stage.clearance))]
             letters = [letter for letter, turns in enumerate(junction.signal_turns) if turns]
-            if closed := tuple(each for each in letters if not any(state[each] in "Gg" for state in shown)):
+            if closed := [each for each in letters if not any(state[each] in "Gg" for state in shown)]:
                 found[junction.id] = closed
         return found
 

@@ -41,7 +41,7 @@ def _junction(network: Network, index: int, refused: Mapping[str, str]) -> dict[
         "made_to_yield": list(junction.made_to_yield),
         "given_yellow": list(junction.given_yellow),
         "kept_waiting": list(junction.kept_waiting),
-        "never_green": list(network.never_green.get(junction.id, ())),
+        "never_green": network.never_green.get(junction.id, []),
     }
 
 

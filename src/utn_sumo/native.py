@@ -104,6 +104,7 @@ def measured(
         "bridge_time_s": time.perf_counter() - started - outcome.sumo_time_s,
         "interrupted": outcome.interrupted,
         "left_alone": dict(judged.left_alone) if judged else {},
+        "never_green": dict(judged.never_green) if judged else {},
         "unsafe_reasons": verdict.reasons[:20] if verdict else [],
         "fallback_reasons": [],
         "out": str(folder),

@@ -462,3 +462,15 @@ def test_who_was_never_called_for_is_not_late_but_who_was_and_finds_no_room_is(
     assert result["arrived"] + result["unfinished"] == len(late)
     delay_s = sum(float(departure) + float(loss) for _, departure, _, loss, _, _ in late)
     assert result["total_delay_veh_h"] == pytest.approx(delay_s / 3600)
+
+
+@pytest.mark.parametrize("controller", ["native", "fixed"])
+def test_who_never_has_green_is_named_at_the_end_of_a_run(controller: str, tmp_path: Path) -> None:
+    net = odd_nets.row("C").net(tmp_path, odd_nets.NO_TURNAROUNDS)
+    odd_nets.retime(net, odd_nets.tl_logic("C", [(seconds, f"r{shown[1:]}") for seconds, shown in odd_nets.TWO_STAGES]))
+    chosen, out = odd_nets.case(tmp_path, odd_nets.traffic("C")), tmp_path / "out"
+    words = ["run", str(chosen), "--controller", controller, "--hours", "0.05", "--out", str(out)]
+    run = CliRunner().invoke(cli, words)
+    assert run.exit_code == 0, run.output
+    assert "C: signal 0 has no green in its programme: nobody goes there" in run.output
+    assert json.loads((out / "result.json").read_text(encoding="utf-8"))["never_green"] == {"C": [0]}
