@@ -57,6 +57,9 @@ PAPER_VIOLATIONS = [
 ]
 
 
+NEVER_GREEN = "has no green in its programme: nobody goes there"
+
+
 @contextmanager
 def progress(scenario: Scenario) -> Iterator[Callable[[RunProgress], None]]:
     """A progress bar with time to go, time spent so far and the present queue; it shows up with the first cycle,
@@ -102,9 +105,7 @@ def table(result: dict[str, Any]) -> None:
     for reason in [*result.get("unsafe_reasons", []), *result.get("fallback_reasons", [])]:
         console.print(f"  ! {reason}")
     for junction, letters in result.get("never_green", {}).items():
-        console.print(
-            f"  ! {junction}: signal {', '.join(map(str, letters))} has no green in its programme: nobody goes there"
-        )
+        console.print(f"  ! {junction}: signal {', '.join(map(str, letters))} {NEVER_GREEN}")
     if not result["arrived"] + result["unfinished"]:
         console.print("  ! nobody departed: no vehicle of the routes departs in this window, give another one")
     if result["left_out_veh"]:
@@ -237,7 +238,7 @@ def _controlled(junction: dict[str, Any]) -> str:
         "made_to_yield": "gives way to who has green with it",
         "given_yellow": "is given the yellow that it lacks",
         "kept_waiting": "waits until others are cleared",
-        "never_green": "has no green in its programme: nobody goes there",
+        "never_green": NEVER_GREEN,
     }
     said = [f"signal {', '.join(map(str, junction[key]))} {how}" for key, how in notes.items() if junction[key]]
     return ", ".join(["yes", *said])
