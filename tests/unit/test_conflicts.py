@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -138,6 +140,48 @@ def test_lanes_of_one_road_that_lead_into_one_lane_are_at_peace(street_of: Stree
         if (net.links[net.turns[index].link].id, net.turns[index].to_edge) == ("nC-C", "C-sC")
     )
     assert {frozenset((across, letter)) for letter in letters} <= conflicting(net)
+
+
+def weaving(folder: Path, *, who_waits: bool) -> Path:
+    """Ahead is a fork, to whose left road the west's right lane leads, and the left one to the right: they cross.
+
+    Both go straight on, and whether either waits for the other is told, as in nets of old netconverts and wide forks.
+    """
+    drawn = row("C").without("W-C")
+    drawn.one_way("W", "C", lanes=2)
+    drawn.node("F", 200, 60)
+    drawn.one_way("C", "F")
+    drawn.connection("W-C", "C-F", fromLane=0, toLane=0)
+    drawn.connection("W-C", "C-E", fromLane=1, toLane=0)
+    clears = [(3, "rrrryyyyrrrryy"), (27, "GGggrrrrGGGgrr"), (3, "yyyyrrrryyyyrr")]
+    net = retime(drawn.net(folder, NO_TURNAROUNDS), tl_logic("C", [(27, "rrrrggggrrrrGG"), *clears]))
+    tree = ET.parse(net)
+    (fork,) = (each for each in tree.iter("connection") if each.get("from") == "W-C" and each.get("to") == "C-F")
+    fork.set("dir", "s")
+    if not who_waits:
+        (request,) = (each for each in tree.iter("request") if each.get("index") == str(TO_FORK))
+        # Letters count from the right.
+        bits = list(request.attrib["response"])
+        assert bits[-1 - BESIDE] == "1"
+        bits[-1 - BESIDE] = "0"
+        request.set("response", "".join(bits))
+    tree.write(net)
+    return net
+
+
+TO_FORK, BESIDE = 12, 13
+
+
+@pytest.mark.parametrize("who_waits", [True, False])
+def test_lanes_of_one_road_that_cross_and_have_green_together_are_controlled(
+    street_of: StreetOf, who_waits: bool
+) -> None:
+    net = street_of(partial(weaving, who_waits=who_waits))
+    assert not signals.refused(net)
+    assert net.junctions[0].made_to_yield == ((TO_FORK,) if who_waits else ())
+    (shown,) = (stage.state for stage in net.stages if stage.state[BESIDE] == "G")
+    assert shown[TO_FORK] == ("g" if who_waits else "G")
+    assert {frozenset((NORTH + AHEAD, letter)) for letter in (TO_FORK, BESIDE)} <= conflicting(net)
 
 
 @pytest.mark.parametrize("stream", [NORTH + RIGHT, NORTH + AHEAD, NORTH + LEFT, SOUTH + AHEAD])

@@ -62,8 +62,8 @@ class Signal:
     def conflicts(self) -> tuple[tuple[bool, ...], ...]:
         """Which letters' streams conflict, by the net's right-of-way matrix.
 
-        None do that come from one road into one lane; nor do pedestrians and who turns onto their street, who always
-        gives way to them.
+        None do that come from one road and go into one lane, or cross each other's way where neither gives way;
+        nor do pedestrians and who turns onto their street, who always gives way to them.
         """
         matrix = [[False] * self.letters for _ in range(self.letters)]
         streams = [
@@ -72,7 +72,7 @@ class Signal:
         ]
         for node, request, a, connection in streams:
             foes = [
-                (b, other.getFrom() is connection.getFrom() and other.getToLane() is connection.getToLane())
+                (b, other.getFrom() is connection.getFrom() and _side_by_side(node, connection, other))
                 for node_b, request_b, b, other in streams
                 if node_b is node and _are_foes(node, request, request_b)
             ]
@@ -92,7 +92,8 @@ class Signal:
         """Pairs of letters that conflict and have protected greens together, of which the first gives way.
 
         By the net's right-of-way matrix. Some turn: netconvert gives opposite left turns such a stage even where they
-        meet, amid a skew or wide junction. Others join the second one's road, and meet nobody else who has way.
+        meet, amid a skew or wide junction. Others join the second one's road or come from it, and meet nobody else who
+        has way.
         """
         phases = self.programme.phases if self.programme else ()
         together = {
@@ -100,12 +101,12 @@ class Signal:
             for a, b in permutations(range(self.letters), 2)
             if self.conflicts[a][b] and any(phase.state[a] == phase.state[b] == "G" for phase in phases)
         }
-        turning, joining = (
+        turning, sharing = (
             {(a, b) for a, b in together if self._gives_way(a, b, how) and not self._gives_way(b, a, how)}
-            for how in (_turns, _joins)
+            for how in (_turns, _shares)
         )
-        settled = {pair for a, b in turning | joining for pair in ((a, b), (b, a))}
-        return turning | {(a, b) for a, b in joining if all(pair in settled for pair in together if pair[0] == a)}
+        settled = {pair for a, b in turning | sharing for pair in ((a, b), (b, a))}
+        return turning | {(a, b) for a, b in sharing if all(pair in settled for pair in together if pair[0] == a)}
 
     def _gives_way(self, a: int, b: int, how: Callable[[Any, Any], bool]) -> bool:
         """Whether all of letter `a` whom anybody of letter `b` comes in the way of move so, and must give way to him.
@@ -127,8 +128,13 @@ def _turns(connection: Any, _other: Any) -> bool:
     return bool(connection.getDirection() != STRAIGHT)
 
 
-def _joins(connection: Any, other: Any) -> bool:
-    return connection.getTo() is other.getTo()
+def _shares(connection: Any, other: Any) -> bool:
+    return connection.getTo() is other.getTo() or connection.getFrom() is other.getFrom()
+
+
+def _side_by_side(node: Any, one: Any, other: Any) -> bool:
+    """Whether two who come from one road go into one lane, or see to it among themselves who goes first."""
+    return one.getToLane() is other.getToLane() or not (node.forbids(one, other) or node.forbids(other, one))
 
 
 def _are_foes(node: Any, one: int, other: int) -> bool:
