@@ -70,6 +70,13 @@ def test_a_button_is_pressed_by_who_wants_to_go_over_its_crossing_and_by_nobody_
     assert buttons.read().tolist() == [0, 1, 0, 0]
     both = Buttons(network, ids(network).calling, People({area: [crossing], other: ["home", crossing]}, set()))
     assert both.read().tolist() == [0, 2, 0, 0]
+    letter = network.callers[1][1].letter
+    letters = ["r"] * len(network.junctions[0].signal_turns)
+    assert not buttons.pressed(0, "".join(letters))
+    letters[letter] = "G"
+    assert buttons.pressed(0, "".join(letters))
+    going_home = Buttons(network, ids(network).calling, People({area: ["home"], other: []}, set()))
+    assert not going_home.pressed(0, "".join(letters))
 
 
 def test_who_is_close_on_a_lane_of_his_own_calls(street_of: StreetOf) -> None:

@@ -28,6 +28,12 @@ class Traffic:
         self.inside_veh: dict[int, float] = defaultdict(float)
         self.standing_veh: dict[int, float] = defaultdict(float)
         self.coming_veh: dict[int, float] = defaultdict(float)
+        self.pressing = False
+
+    def pressed(self, junction: int, letters: str) -> bool:
+        assert junction >= 0
+        assert "G" in letters
+        return self.pressing
 
     def amid_veh(self, turn: int) -> float:
         return self.inside_veh[turn]
@@ -179,6 +185,7 @@ class Walked:
         self.network = network
         self.first, self.then = network.junctions[0].stages
         self.traffic = Traffic()
+        self.traffic.pressing = True
         self.inside = Inside(network, self.traffic)
         self.late = _turns_with(network, self.first, "gG")
 
@@ -222,6 +229,19 @@ def test_nobody_is_held_for_one_who_has_left_or_has_green_in_the_next_stage(walk
     assert not walked.inside.holds(0, 23.0)
     for next_turn in _turns_with(walked.network, walked.then, "gG"):
         assert not walked.holds_for(next_turn, *everybody)
+
+
+def test_nobody_is_held_where_people_could_walk_and_none_is_about_to(walked: Walked) -> None:
+    everybody = defaultdict(float, dict.fromkeys(range(len(walked.network.groups)), 1.0))
+    walked.traffic.inside_veh, walked.traffic.coming_veh = defaultdict(float, {walked.late[0]: 1.0}), everybody
+    for pressing in (False, True, False):
+        walked.traffic.pressing = pressing
+        _lead(walked.inside, walked.first, walked.then)
+        assert walked.inside.holds(0, 23.0) == pressing
+    # Who stands behind a turn that found no gap is waited for all the same.
+    walked.traffic.standing_veh = defaultdict(float, {walked.late[0]: 1.0})
+    _lead(walked.inside, walked.first, walked.then)
+    assert walked.inside.holds(0, 23.0)
 
 
 def test_who_stands_behind_a_turn_that_shares_its_lane_holds_those_who_would_come_into_its_way(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from utn_sumo.clearances import GREEN
 from utn_sumo.contract import Floats, Network
 from utn_sumo.plant.functions import bare
 
@@ -22,6 +23,9 @@ class Buttons:
             for number, (_, caller) in enumerate(network.callers)
             for area, crossing in caller.buttons
         ]
+        self._of_junction: dict[int, list[tuple[int, str, str]]] = {}
+        for index, caller in network.callers:
+            self._of_junction.setdefault(index, []).extend((caller.letter, *button) for button in caller.buttons)
         self._areas = sorted({area for _, area, _ in self._buttons})
         self._detectors = [(number, name) for number, names in enumerate(detectors) for name in names]
         self._callers = len(network.callers)
@@ -44,3 +48,15 @@ class Buttons:
             called[number] += self._present(name)
         self.sumo_time_s += time.perf_counter() - started
         return called
+
+    def pressed(self, junction: int, letters: str) -> bool:
+        """Whether any button of a junction is pressed whose crossing has green among these letters of its signal."""
+        started = time.perf_counter()
+        pressed = any(
+            self._next_edge(person) == crossing
+            for letter, area, crossing in self._of_junction.get(junction, ())
+            if letters[letter] in GREEN
+            for person in self._people(area)
+        )
+        self.sumo_time_s += time.perf_counter() - started
+        return pressed

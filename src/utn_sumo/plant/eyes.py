@@ -113,6 +113,10 @@ class Eyes:
         """(C,) of contract.View."""
         return self._buttons.read()
 
+    def pressed(self, junction: int, letters: str) -> bool:
+        """Whether somebody waits at a junction to walk where there is green among these letters of its signal."""
+        return self._buttons.pressed(junction, letters)
+
     def side_standing_veh(self, roads: Bools) -> Floats:
         """(R,) of contract.View."""
         return self._side_areas.read(self._halting, roads)

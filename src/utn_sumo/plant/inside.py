@@ -6,7 +6,8 @@ roads wait for each other nobody ever moves again. Where people walk, whoever ca
 too, turning or not: by those who step onto the crossing at its exit with the next green, or behind one who is. And who
 goes straight on from a lane that turns share may stand behind one of them until the green has ended, and is amid the
 junction when the next road's turns come into it. So while the lane-area detectors amid it see such vehicles, and others
-are about to come into their way, the red before the next green lasts.
+are about to come into their way, the red before the next green lasts. People are about to walk where a button is
+pressed for a crossing that has green then.
 
 Who stands before a road within the junction has the next green for himself where there are several: those from opposite
 sides stand in each other's way, and with others who come in nobody gets out any more.
@@ -35,6 +36,7 @@ class Areas(Protocol):
     def stuck_veh(self, turn: int) -> float: ...
     def standing_amid_veh(self, turn: int) -> float: ...
     def close_veh(self, group: int) -> float: ...
+    def pressed(self, junction: int, letters: str) -> bool: ...
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,8 @@ class Inside:
         """On which each junction came to its present stage, and when that begins at the latest."""
         self._stuck: dict[int, set[int]] = {}
         """By junction the turns of which somebody has been stuck since it was led to its present stage."""
+        self._walked: dict[int, bool] = {}
+        """By junction whether somebody was about to walk with its present stage as it was led to it."""
 
     def may_hold(self) -> Bools:
         """(J,) junctions in which somebody may be left."""
@@ -96,16 +100,19 @@ class Inside:
         if (index, first, then) not in self._known:
             self._known[index, first, then] = self._way(index, first, then, cleared)
         self._ways[index] = self._known[index, first, then], opens_s + MOST_HOLD_S
+        self._walked[index] = self._areas.pressed(index, self._network.stages[then].state)
         self._stuck[index] = set()
         self._look(index)
 
     def _look(self, index: int) -> set[int]:
         """Turns of which nobody is to be amid the junction when its next green begins."""
-        (way, _), stuck = self._ways[index], self._stuck[index]
-        is_walked, stuck_veh = self._network.junctions[index].is_walked, self._areas.stuck_veh
+        (way, _), stuck, walked = self._ways[index], self._stuck[index], self._walked[index]
         # Who has been stuck, and sets off, may have to stop once more before he is out of the way.
-        stuck.update(turn for turn, _ in way.stopped if is_walked or stuck_veh(turn) > 0)
+        stuck.update(turn for turn, _ in way.stopped if walked or self._stands_behind(turn))
         return stuck
+
+    def _stands_behind(self, turn: int) -> bool:
+        return turn in self._behind and self._areas.stuck_veh(turn) > 0
 
     def _way(self, index: int, first: int, then: int, cleared: str) -> Way:
         network, junction, turnings = self._network, self._network.junctions[index], self._turnings[index]
