@@ -63,6 +63,22 @@ def test_lanes_for_bicycles_are_seen_and_no_car_calls(street_of: StreetOf) -> No
     assert not street_of(odd_nets.plain).callers
 
 
+def path_off_a_street(folder: Path) -> Path:
+    """From the west's only lane bicycles may turn onto a path of theirs."""
+    drawn = odd_nets.row("C")
+    drawn.node("P", 200, 60)
+    drawn.one_way("C", "P", allow="bicycle")
+    return drawn.net(folder, odd_nets.NO_TURNAROUNDS)
+
+
+def test_cars_on_a_lane_from_which_bicycles_turn_onto_a_path_do_not_call_as_if_they_were_some(
+    street_of: StreetOf,
+) -> None:
+    network = street_of(path_off_a_street)
+    assert network.callers
+    assert not any(caller.lanes for _, caller in network.callers)
+
+
 def test_a_button_is_pressed_by_who_wants_to_go_over_its_crossing_and_by_nobody_else(street_of: StreetOf) -> None:
     network = street_of(odd_nets.pedestrians)
     (area, crossing), (other, _) = network.callers[1][1].buttons

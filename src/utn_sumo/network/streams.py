@@ -44,14 +44,25 @@ class Signal:
         for crossing in self._walked:
             for letter in crossing.letters:
                 buttons.setdefault(letter, set()).update((area, crossing.id) for area in crossing.areas)
+        motors: dict[Any, set[int]] = defaultdict(set)
+        for connection, letter in self.connections:
+            if for_motors([connection]):
+                motors[connection.getFromLane()].add(letter)
         lanes: dict[int, set[str]] = {}
         for connection, letter in self.connections:
-            lanes.setdefault(letter, set()).update(_stood_on(connection.getFromLane()))
+            # Who stands on a lane of motor traffic that has green with him may be anybody, and is seen with it.
+            if not self._go_together(letter, motors[connection.getFromLane()]):
+                lanes.setdefault(letter, set()).update(_stood_on(connection.getFromLane()))
         return tuple(
             Caller(letter, tuple(sorted(buttons.get(letter, ()))), tuple(sorted(lanes.get(letter, ()))))
             for letter in sorted((buttons.keys() | self.beside_motors) - self.of_motors)
             if letter < self.letters
         )
+
+    def _go_together(self, letter: int, others: set[int]) -> bool:
+        """Whether some phase gives green to a letter and to any of the others."""
+        phases = self.programme.phases if self.programme else ()
+        return any(letter in phase.green and not phase.green.isdisjoint(others) for phase in phases)
 
     @cached_property
     def approaches(self) -> list[str]:
