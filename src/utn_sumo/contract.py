@@ -157,7 +157,8 @@ class Caller:
     buttons: tuple[tuple[str, str], ...] = ()
     """Walking area and crossing, SUMO's edges: in the one a button stands for who wants to go over the other."""
     lanes: tuple[str, ...] = ()
-    """Lanes for bicycles or trams alone that end at the stop line, or lead to one on which nobody can stand."""
+    """Lanes that end at the stop line, or lead to one on which nobody can stand: for bicycles or trams alone, or shared
+    with motor traffic that never has green with them."""
 
 
 @dataclass(frozen=True)
