@@ -158,9 +158,29 @@ def test_a_stage_that_is_held_begins_later_and_has_its_least_green_all_the_same(
         heads.advance(now)
     state = network.stages[crossing.across].state
     assert heads.begin_s[0] == planned_s + MOST_HOLD_S
+    held = {letters for second, letters in shown if planned_s <= second < heads.begin_s[0]}
+    assert held == {heads._inside.meanwhile(0)}  # type: ignore[union-attr]
     assert [second for second, letters in shown if letters == state] == [heads.begin_s[0]]
     least_s = network.stages[crossing.across].least_green_s
     assert [bool(heads.free(heads.begin_s[0] + late_s)[0]) for late_s in (least_s - 1, least_s)] == [False, True]
+
+
+def test_all_others_of_the_next_green_have_it_while_turns_wait_for_those_inside(crossing: Crossing) -> None:
+    network, state = crossing.network, crossing.network.stages[crossing.across].state
+    crossing.full()
+    _lead(crossing.inside, crossing.through, crossing.across)
+    turning = {
+        letter
+        for letter, turns in enumerate(network.junctions[0].signal_turns)
+        if set(turns) & set(crossing.next_turning)
+    }
+    assert turning
+    assert crossing.inside.meanwhile(0) == "".join("r" if i in turning else shown for i, shown in enumerate(state))
+    assert "G" in crossing.inside.meanwhile(0)
+    # Who has had green all along keeps it: without yellow nobody's ends.
+    inside = Inside(network, crossing.traffic)
+    inside.leads(0, crossing.through, crossing.across, state, 23.0)
+    assert inside.meanwhile(0) == state
 
 
 def test_where_reds_may_be_drawn_out_who_waits_is_served_sooner(crossing: Crossing) -> None:
@@ -220,6 +240,18 @@ def test_where_people_walk_one_who_is_inside_holds_those_who_would_come_into_its
         assert walked.holds_for(turn, *joins)
         assert walked.inside.holds(0, 23.0 + MOST_HOLD_S - 1)
         assert not walked.inside.holds(0, 23.0 + MOST_HOLD_S)
+
+
+def test_who_walks_waits_for_those_inside_and_who_drives_on_does_not(walked: Walked) -> None:
+    junction, state = walked.network.junctions[0], walked.network.stages[walked.then].state
+    assert walked.holds_for(walked.late[0], *range(len(walked.network.groups)))
+    meanwhile = walked.inside.meanwhile(0)
+    walking = {letter for letter in junction.crossings if state[letter] in "gG"}
+    assert walking
+    assert {meanwhile[letter] for letter in walking} == {"r"}
+    driving = [letter for letter, shown in enumerate(state) if shown == "G" and letter not in junction.crossings]
+    assert driving
+    assert {meanwhile[letter] for letter in driving} == {"G"}
 
 
 def test_nobody_is_held_for_one_who_has_left_or_has_green_in_the_next_stage(walked: Walked) -> None:

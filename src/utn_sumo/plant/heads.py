@@ -15,7 +15,7 @@ from utn_sumo.plant.inside import MOST_HOLD_S, Areas, Inside
 from utn_sumo.plant.patience import LONGEST_RED_S, Patience
 
 HOLD_S = 1.0
-"""By which a stage begins later as long as somebody is amid the junction."""
+"""By which a stage begins later for some as long as somebody is amid the junction."""
 
 
 class Heads:
@@ -64,8 +64,7 @@ class Heads:
         while self._due and self._due[0][0] <= now_s:
             _, index, _, letters, opens = heappop(self._due)
             if opens and self._inside is not None and self._inside.holds(index, now_s):
-                if outwards := self._inside.outwards(index):
-                    self._show(index, outwards)
+                self._show(index, self._inside.meanwhile(index))
                 self.begin_s[index] += HOLD_S
                 self._ready_s[index] += HOLD_S
                 heappush(self._due, (now_s + HOLD_S, index, next(self._numbers), letters, True))

@@ -6,8 +6,9 @@ roads wait for each other nobody ever moves again. Where people walk, whoever ca
 too, turning or not: by those who step onto the crossing at its exit with the next green, or behind one who is. And who
 goes straight on from a lane that turns share may stand behind one of them until the green has ended, and is amid the
 junction when the next road's turns come into it. So while the lane-area detectors amid it see such vehicles, and others
-are about to come into their way, the red before the next green lasts. People are about to walk where a button is
-pressed for a crossing that has green then.
+are about to come into their way, those who would stand in it then have to wait: turns in gaps, and people who walk. All
+others of the next green have it meanwhile; they drive on as soon as they can. People are about to walk where a button
+is pressed for a crossing that has green then.
 
 Who stands before a road within the junction has the next green for himself where there are several: those from opposite
 sides stand in each other's way, and with others who come in nobody gets out any more.
@@ -15,6 +16,7 @@ sides stand in each other's way, and with others who come in nobody gets out any
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -24,7 +26,7 @@ from utn_sumo.clearances import GIVES_WAY, GREEN, HAS_WAY, following
 from utn_sumo.contract import Bools, Junction, Network
 
 MOST_HOLD_S = 7.0
-"""Longer the red is not drawn out: who is still there does not get away by it."""
+"""Longer nobody has to wait: who is still there does not get away by it."""
 BESIDE_VEH = 1.0
 """Who turns from a single lane can do so beside one other, who goes as soon as he has; not from two lanes abreast."""
 
@@ -66,10 +68,12 @@ class Way:
     """Turns onto roads within the junction that have green in the next stage."""
     outwards: str
     """The letters of that stage with those red that do not lead off such roads, but for who keeps green all along."""
+    through: str
+    """With those red of turns that give way in some stage, and of people, but for who keeps green all along."""
 
 
 class Inside:
-    """Knows who may wait amid each junction, and how long others have to wait for them."""
+    """Knows who may wait amid each junction, and who has to wait for them how long."""
 
     def __init__(self, network: Network, areas: Areas):
         self._network = network
@@ -80,7 +84,7 @@ class Inside:
         self._known: dict[tuple[int, int, int], Way] = {}
         """By junction and its stages from which and to which they lead."""
         self._ways: dict[int, tuple[Way, float]] = {}
-        """On which each junction came to its present stage, and when that begins at the latest."""
+        """On which each junction came to its present stage, and when all of that have green at the latest."""
         self._stuck: dict[int, set[int]] = {}
         """By junction the turns of which somebody has been stuck since it was led to its present stage."""
         self._walked: dict[int, bool] = {}
@@ -134,19 +138,25 @@ class Inside:
         # To the stage that follows it is the net's own clearance, to the second, but for who walks or is stuck.
         is_own = then == following(junction, first)
         within, outwards = _outwards(network, junction, becomes, cleared)
-        return Way(() if is_own else tuple(left), tuple(coming), stopped, within, outwards)
+        waits = {*junction.crossings, *(each.letter for each in turnings)}
+        through = _open(becomes, cleared, (letter not in waits for letter in range(len(becomes))))
+        return Way(() if is_own else tuple(left), tuple(coming), stopped, within, outwards, through)
 
-    def outwards(self, index: int) -> str:
-        """Letters by which they are let out who stand before a road within the junction, empty if nobody does."""
+    def meanwhile(self, index: int) -> str:
+        """Letters that are shown as long as somebody has to wait."""
         way, _ = self._ways[index]
-        return way.outwards if sum(map(self._areas.standing_amid_veh, way.within)) > BESIDE_VEH else ""
+        return way.outwards if self._stands_within(way) else way.through
+
+    def _stands_within(self, way: Way) -> bool:
+        """Whether somebody stands before a road within the junction whom the next stage lets out."""
+        return sum(map(self._areas.standing_amid_veh, way.within)) > BESIDE_VEH
 
     def holds(self, index: int, now_s: float) -> bool:
-        """Whether the stage that a junction is led to has to wait for somebody."""
+        """Whether some of the stage that a junction is led to have to wait for somebody."""
         (way, until_s), areas = self._ways[index], self._areas
         if now_s >= until_s:
             return False
-        if self.outwards(index):
+        if self._stands_within(way):
             return True
         found_no_gap_veh = sum(areas.amid_veh(turn) for turn in way.left)
         if any(found_no_gap_veh > veh and areas.close_veh(group) > 0 for group, veh in way.coming):
@@ -158,20 +168,25 @@ class Inside:
         )
 
 
+def _open(state: str, cleared: str, opened: Iterable[bool]) -> str:
+    """A state with green for letters that are `opened` alone, and for who has had it in the letters before, `cleared`.
+
+    Without yellow nobody's ends.
+    """
+    letters = zip(state, cleared, opened, strict=True)
+    return "".join(shown if opens or shown not in GREEN or was in GREEN else "r" for shown, was, opens in letters)
+
+
 def _outwards(network: Network, junction: Junction, state: str, cleared: str) -> tuple[tuple[int, ...], str]:
     """Turns onto roads within a junction off which a state lets, and that state with green for who leaves them alone.
 
-    And for who has had it in the letters before, `cleared`: without yellow nobody's ends. None where nobody else has
-    green in it.
+    None where nobody else has green in it.
     """
     leads = [
         {network.turns[turn].link for turn in turns if network.within[network.turns[turn].link]}
         for turns in junction.signal_turns
     ]
-    outwards = "".join(
-        shown if off or shown not in GREEN or before in GREEN else "r"
-        for shown, off, before in zip(state, leads, cleared, strict=True)
-    )
+    outwards = _open(state, cleared, map(bool, leads))
     links = {link for shown, off in zip(state, leads, strict=True) if shown in GREEN for link in off}
     turns = tuple(index for index, turn in enumerate(network.turns) if turn.next_link in links)
     return (turns, outwards) if outwards != state else ((), "")
