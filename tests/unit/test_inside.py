@@ -38,9 +38,6 @@ class Traffic:
     def amid_veh(self, turn: int) -> float:
         return self.inside_veh[turn]
 
-    def stuck_veh(self, turn: int) -> float:
-        return self.standing_veh[turn]
-
     def standing_amid_veh(self, turn: int) -> float:
         return self.standing_veh[turn]
 
@@ -183,6 +180,18 @@ def test_all_others_of_the_next_green_have_it_while_turns_wait_for_those_inside(
     assert inside.meanwhile(0) == state
 
 
+def test_nobody_comes_in_while_more_than_two_stand_amid_the_junction(crossing: Crossing) -> None:
+    traffic = crossing.full()
+    _lead(crossing.inside, crossing.through, crossing.across)
+    for standing in (0.0, 2.0, 3.0):
+        traffic.standing_veh = defaultdict(float, {crossing.turning[0]: standing})
+        assert crossing.inside.holds(0, 23.0)
+        assert ("G" in crossing.inside.meanwhile(0)) == (standing <= 2)
+    # Who has green in the next stage is in nobody's way.
+    traffic.standing_veh = defaultdict(float, {crossing.next_turning[0]: 3.0})
+    assert "G" in crossing.inside.meanwhile(0)
+
+
 def test_where_reds_may_be_drawn_out_who_waits_is_served_sooner(crossing: Crossing) -> None:
     network = crossing.network
     stages = tuple(replace(stage, least_green_s=30.0) for stage in network.stages)
@@ -270,49 +279,69 @@ def test_nobody_is_held_where_people_could_walk_and_none_is_about_to(walked: Wal
         walked.traffic.pressing = pressing
         _lead(walked.inside, walked.first, walked.then)
         assert walked.inside.holds(0, 23.0) == pressing
-    # Who stands behind a turn that found no gap is waited for all the same.
-    walked.traffic.standing_veh = defaultdict(float, {walked.late[0]: 1.0})
+    # Who goes straight on from a lane that turns share is waited for all the same.
+    walked.traffic.inside_veh = defaultdict(float, {_straight_on(walked.network, walked.first): 1.0})
     _lead(walked.inside, walked.first, walked.then)
     assert walked.inside.holds(0, 23.0)
 
 
-def test_who_stands_behind_a_turn_that_shares_its_lane_holds_those_who_would_come_into_its_way(
+def _straight_on(network: Network, stage: int) -> int:
+    """A turn of the first junction that has way in a stage and crosses more streams than any other one."""
+    junction, state = network.junctions[0], network.stages[stage].state
+    letters = [i for i, turns in enumerate(junction.signal_turns) if turns and state[i] == "G"]
+    crossed = {letter: int(np.sum(junction.conflicts[letter])) for letter in letters}
+    return junction.signal_turns[max(letters, key=crossed.__getitem__)][0]
+
+
+def test_who_may_be_behind_a_turn_that_shares_its_lane_has_those_wait_who_would_turn_into_its_way(
     street_of: StreetOf,
 ) -> None:
     network = street_of(odd_nets.plain)
     first, then = network.junctions[0].stages
-    giving, going = (_turns_with(network, first, letters) for letters in "gG")
-    ahead = next(turn for turn in going if any(network.turns[turn].link == network.turns[left].link for left in giving))
-    left = next(turn for turn in giving if network.turns[turn].link == network.turns[ahead].link)
+    ahead = _straight_on(network, first)
+    left = next(
+        turn for turn in _turns_with(network, first, "g") if network.turns[turn].link == network.turns[ahead].link
+    )
     assert set(network.turns[ahead].from_lanes) & set(network.turns[left].from_lanes)
+    turning = {network.turns[turn].group for turn in _turns_with(network, then, "g")}
     traffic = Traffic()
     inside = Inside(network, traffic)
+    # One turn alone can be passed by those of the next road.
     for turn, is_held in ((ahead, True), (left, False)):
-        traffic.standing_veh = defaultdict(float, {turn: 1.0})
         traffic.inside_veh = defaultdict(float, {turn: 1.0})
-        for groups in ({network.turns[other].group for other in _turns_with(network, then, "gG")}, set[int]()):
+        for groups in (turning, set[int]()):
             traffic.coming_veh = defaultdict(float, dict.fromkeys(groups, 1.0))
             _lead(inside, first, then)
             assert inside.holds(0, 23.0) == (is_held and len(groups) > 0)
             assert not inside.holds(0, 23.0 + MOST_HOLD_S)
-    # Who drives is not waited for, nor who has green in the next stage too.
     everybody = defaultdict(float, dict.fromkeys(range(len(network.groups)), 1.0))
-    traffic.standing_veh, traffic.inside_veh, traffic.coming_veh = defaultdict(float), {ahead: 1.0}, everybody
+    traffic.inside_veh, traffic.coming_veh = defaultdict(float, {ahead: 1.0}), everybody
     _lead(inside, first, then)
-    assert not inside.holds(0, 23.0)
-    traffic.standing_veh = defaultdict(float, {ahead: 1.0})
-    _lead(inside, then, first)
-    assert not inside.holds(0, 23.0)
-    # But who has stood since the green ended is let out, though he has set off.
-    _lead(inside, first, then)
-    traffic.standing_veh = defaultdict(float)
     assert inside.holds(0, 23.0)
     traffic.inside_veh = defaultdict(float)
     assert not inside.holds(0, 24.0)
-    # That was another green.
+    # Nor who has green in the next stage too.
     traffic.inside_veh = defaultdict(float, {ahead: 1.0})
-    _lead(inside, first, then)
+    _lead(inside, then, first)
     assert not inside.holds(0, 23.0)
+    # Where nobody would be stopped all have green at once.
+    inside = Inside(network, traffic)
+    inside.leads(0, first, then, network.stages[then].state, 23.0)
+    assert not inside.holds(0, 23.0)
+
+
+def test_two_turns_that_found_no_gap_have_those_of_the_other_road_wait_in_the_net_s_own_order_too(
+    street_of: StreetOf,
+) -> None:
+    network = street_of(odd_nets.plain)
+    first, then = network.junctions[0].stages
+    traffic = Traffic()
+    inside = Inside(network, traffic)
+    traffic.coming_veh = defaultdict(float, dict.fromkeys(range(len(network.groups)), 1.0))
+    for veh in (1.0, 2.0):
+        traffic.inside_veh = defaultdict(float, {_turns_with(network, first, "g")[0]: veh})
+        _lead(inside, first, then)
+        assert inside.holds(0, 23.0) == (veh > 1)
 
 
 def test_where_no_turn_gives_way_nobody_is_ever_waited_for(utn17: Network) -> None:

@@ -1,14 +1,14 @@
-"""Who waits amid a junction when the green that let it in has ended: turns that give way to others.
+"""Who is amid a junction when the green that let it in has ended: turns that give way, and who is behind them.
 
 Those who found no gap in oncoming traffic have a stage of their own then, in the net's own programme. Where that one is
 left out, the next road's green finds them in its way, its own turns come to stand beside them, and when those of all
-roads wait for each other nobody ever moves again. Where people walk, whoever came in late is stopped amid the junction
-too, turning or not: by those who step onto the crossing at its exit with the next green, or behind one who is. And who
-goes straight on from a lane that turns share may stand behind one of them until the green has ended, and is amid the
-junction when the next road's turns come into it. So while the lane-area detectors amid it see such vehicles, and others
-are about to come into their way, those who would stand in it then have to wait: turns in gaps, and people who walk. All
-others of the next green have it meanwhile; they drive on as soon as they can. People are about to walk where a button
-is pressed for a crossing that has green then.
+roads wait for each other nobody ever moves again. Who goes straight on from a lane that turns share may be behind one
+of them, and is amid the junction, too, when the next road's turns come into it. And where people walk, whoever came in
+late is stopped amid the junction, turning or not: by those who step onto the crossing at its exit with the next green,
+or behind one who is. So while the lane-area detectors amid it see such vehicles, and others are about to come into
+their way, those who would stand in it then have to wait: turns in gaps, and people who walk. All others of the next
+green have it meanwhile, they drive on as soon as they can, unless so many stand there that these would stop, too, and
+block each other. People are about to walk where a button is pressed for a crossing that has green then.
 
 Who stands before a road within the junction has the next green for himself where there are several: those from opposite
 sides stand in each other's way, and with others who come in nobody gets out any more.
@@ -22,11 +22,13 @@ from typing import Protocol
 
 import numpy as np
 
-from utn_sumo.clearances import GIVES_WAY, GREEN, HAS_WAY, following
+from utn_sumo.clearances import GIVES_WAY, GREEN, HAS_WAY
 from utn_sumo.contract import Bools, Junction, Network
 
 MOST_HOLD_S = 7.0
 """Longer nobody has to wait: who is still there does not get away by it."""
+MOST_STANDING_VEH = 2.0
+"""Who drives on gets past so many who stand amid the junction; of more each may be in the way of the next one."""
 BESIDE_VEH = 1.0
 """Who turns from a single lane can do so beside one other, who goes as soon as he has; not from two lanes abreast."""
 
@@ -35,7 +37,6 @@ class Areas(Protocol):
     """What it takes to know who waits (plant.eyes)."""
 
     def amid_veh(self, turn: int) -> float: ...
-    def stuck_veh(self, turn: int) -> float: ...
     def standing_amid_veh(self, turn: int) -> float: ...
     def close_veh(self, group: int) -> float: ...
     def pressed(self, junction: int, letters: str) -> bool: ...
@@ -61,15 +62,18 @@ class Way:
     """Turns for whom no gap in oncoming traffic may have come, and whom the next stage does not let out."""
     coming: tuple[tuple[int, float], ...]
     """Lane groups of turns of this kind that have green in it, as in `Turning`."""
-    stopped: tuple[tuple[int, tuple[int, ...]], ...]
-    """Turns that people who walk may stop, or one before them that found no gap, each with the lane groups that come
-    into its way."""
+    behind: tuple[tuple[int, tuple[int, ...]], ...]
+    """Turns that one before them may stop who found no gap, each with the lane groups that come into its way."""
+    walked: tuple[tuple[int, tuple[int, ...]], ...]
+    """Turns that people may stop who walk, as `behind`."""
     within: tuple[int, ...]
     """Turns onto roads within the junction that have green in the next stage."""
     outwards: str
     """The letters of that stage with those red that do not lead off such roads, but for who keeps green all along."""
     through: str
     """With those red of turns that give way in some stage, and of people, but for who keeps green all along."""
+    ended: tuple[int, ...]
+    """Turns that have no green in it."""
 
 
 class Inside:
@@ -85,8 +89,6 @@ class Inside:
         """By junction and its stages from which and to which they lead."""
         self._ways: dict[int, tuple[Way, float]] = {}
         """On which each junction came to its present stage, and when all of that have green at the latest."""
-        self._stuck: dict[int, set[int]] = {}
-        """By junction the turns of which somebody has been stuck since it was led to its present stage."""
         self._walked: dict[int, bool] = {}
         """By junction whether somebody was about to walk with its present stage as it was led to it."""
 
@@ -102,23 +104,11 @@ class Inside:
     def leads(self, index: int, first: int, then: int, cleared: str, opens_s: float) -> None:
         """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`, after letters `cleared`."""
         if (index, first, then) not in self._known:
-            self._known[index, first, then] = self._way(index, first, then, cleared)
+            self._known[index, first, then] = self._way(index, then, cleared)
         self._ways[index] = self._known[index, first, then], opens_s + MOST_HOLD_S
         self._walked[index] = self._areas.pressed(index, self._network.stages[then].state)
-        self._stuck[index] = set()
-        self._look(index)
 
-    def _look(self, index: int) -> set[int]:
-        """Turns of which nobody is to be amid the junction when its next green begins."""
-        (way, _), stuck, walked = self._ways[index], self._stuck[index], self._walked[index]
-        # Who has been stuck, and sets off, may have to stop once more before he is out of the way.
-        stuck.update(turn for turn, _ in way.stopped if walked or self._stands_behind(turn))
-        return stuck
-
-    def _stands_behind(self, turn: int) -> bool:
-        return turn in self._behind and self._areas.stuck_veh(turn) > 0
-
-    def _way(self, index: int, first: int, then: int, cleared: str) -> Way:
+    def _way(self, index: int, then: int, cleared: str) -> Way:
         network, junction, turnings = self._network, self._network.junctions[index], self._turnings[index]
         becomes = network.stages[then].state
         left = [
@@ -127,25 +117,37 @@ class Inside:
             if not any(becomes[letter] in GREEN for letter in (each.letter, *each.oncoming))
             for turn in each.turns
         ]
-        coming = [(group, veh) for each in turnings if becomes[each.letter] in GREEN for group, veh in each.groups]
-        stopped = tuple(
-            (turn, _into_its_way(network, junction, letter, becomes))
+        waits = {*junction.crossings, *(each.letter for each in turnings)}
+        through = _open(becomes, cleared, (letter not in waits for letter in range(len(becomes))))
+        wait = [each for each in turnings if becomes[each.letter] in GREEN and through[each.letter] not in GREEN]
+        coming = tuple(group for each in wait for group in each.groups)
+        late = [
+            (turn, letter)
             for letter, turns in enumerate(junction.signal_turns)
             if becomes[letter] not in GREEN
             for turn in turns
-            if junction.is_walked or turn in self._behind
-        )
-        # To the stage that follows it is the net's own clearance, to the second, but for who walks or is stuck.
-        is_own = then == following(junction, first)
+        ]
+        turning, driving = [each.letter for each in wait], [i for i, shown in enumerate(becomes) if shown in GREEN]
+        behind = [(turn, _come(network, junction, letter, turning)) for turn, letter in late if turn in self._behind]
+        walked = [(turn, _come(network, junction, letter, driving)) for turn, letter in late if junction.is_walked]
         within, outwards = _outwards(network, junction, becomes, cleared)
-        waits = {*junction.crossings, *(each.letter for each in turnings)}
-        through = _open(becomes, cleared, (letter not in waits for letter in range(len(becomes))))
-        return Way(() if is_own else tuple(left), tuple(coming), stopped, within, outwards, through)
+        return Way(
+            tuple(left),
+            coming,
+            tuple(behind),
+            tuple(walked),
+            within,
+            outwards,
+            through,
+            tuple(turn for turn, _ in late),
+        )
 
     def meanwhile(self, index: int) -> str:
-        """Letters that are shown as long as somebody has to wait."""
+        """Letters that are shown while somebody has to wait: those of now, if empty."""
         way, _ = self._ways[index]
-        return way.outwards if self._stands_within(way) else way.through
+        if self._stands_within(way):
+            return way.outwards
+        return way.through if sum(map(self._areas.standing_amid_veh, way.ended)) <= MOST_STANDING_VEH else ""
 
     def _stands_within(self, way: Way) -> bool:
         """Whether somebody stands before a road within the junction whom the next stage lets out."""
@@ -161,10 +163,9 @@ class Inside:
         found_no_gap_veh = sum(areas.amid_veh(turn) for turn in way.left)
         if any(found_no_gap_veh > veh and areas.close_veh(group) > 0 for group, veh in way.coming):
             return True
-        late = self._look(index)
+        late = way.walked if self._walked[index] else way.behind
         return any(
-            turn in late and areas.amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups)
-            for turn, groups in way.stopped
+            areas.amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups) for turn, groups in late
         )
 
 
@@ -198,10 +199,10 @@ def _sharing(network: Network, giving: set[int]) -> set[int]:
     return {turn for turns in sets if not giving.isdisjoint(turns) for turn in turns} - giving
 
 
-def _into_its_way(network: Network, junction: Junction, letter: int, state: str) -> tuple[int, ...]:
-    """Lane groups that have green in a state and cross or join the streams of a letter."""
-    crossing = zip(junction.conflicts[letter], state, junction.signal_turns, strict=True)
-    turns = [turn for conflicts, shown, turns in crossing if conflicts and shown in GREEN for turn in turns]
+def _come(network: Network, junction: Junction, letter: int, others: list[int]) -> tuple[int, ...]:
+    """Lane groups of other letters' turns that cross or join the streams of a letter."""
+    conflicts = junction.conflicts[letter]
+    turns = [turn for other in others if conflicts[other] for turn in junction.signal_turns[other]]
     return tuple(sorted({network.turns[turn].group for turn in turns}))
 
 
