@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from utn_sumo import bridge, monitor, streets
-from utn_sumo.contract import Network
+from utn_sumo.contract import EXIT, Network
 from utn_sumo.controllers import EXECUTION, registered
 from utn_sumo.detectors import CAR_M, CREEPING_M_S, ids, write
 from utn_sumo.errors import ControllerError, SettingError, UtnError
@@ -303,6 +303,32 @@ def test_what_nobody_asks_for_is_not_read_and_nothing_is_read_twice(utn17: Netwo
     sight.gap_one_s(0)
     assert sumo.asked["getTimeSinceDetection"] == len(utn17.groups[0].lanes)
     assert "getLastStepHaltingNumber" not in sumo.asked
+
+
+def test_who_stands_amid_a_junction_and_on_the_entry_of_the_road_ahead_is_seen(tmp_path: Path) -> None:
+    net = streets.named(str(odd_nets.offsets(tmp_path)))
+    names = ids(net)
+    turn, other = [t for t, each in enumerate(net.turns) if names.amid[t] and each.next_link != EXIT][:2]
+    standing, covered = set(names.amid[turn]), set(names.entry[net.turns[turn].next_link])
+
+    class Jam(Counting):
+        full = False
+
+        def __getattr__(self, name: str) -> Callable[[str], int]:
+            def read(detector: str) -> int:
+                if name == "getTimeSinceDetection":
+                    return 0 if self.full and detector in covered else 5
+                return int(name == "getLastStepHaltingNumber" and detector in standing)
+
+            return read
+
+    sumo = Jam()
+    eyes = Eyes(net, names, sumo)
+    assert eyes.standing_amid_veh(turn) == len(standing)
+    assert eyes.standing_amid_veh(other) == 0
+    assert not eyes.is_taken(turn)
+    sumo.full = True
+    assert eyes.is_taken(turn)
 
 
 def test_who_creeps_amid_a_junction_is_seen_to_stand_on_whichever_of_its_lanes(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ class Traffic:
         self.standing_veh: dict[int, float] = defaultdict(float)
         self.coming_veh: dict[int, float] = defaultdict(float)
         self.pressing = False
+        self.taken: set[int] = set()
 
     def pressed(self, junction: int, letters: str) -> bool:
         assert junction >= 0
@@ -40,6 +41,9 @@ class Traffic:
 
     def standing_amid_veh(self, turn: int) -> float:
         return self.standing_veh[turn]
+
+    def is_taken(self, turn: int) -> bool:
+        return turn in self.taken
 
     def close_veh(self, group: int) -> float:
         return self.coming_veh[group]
@@ -318,6 +322,10 @@ def test_who_may_be_behind_a_turn_that_shares_its_lane_has_those_wait_who_would_
     traffic.inside_veh, traffic.coming_veh = defaultdict(float, {ahead: 1.0}), everybody
     _lead(inside, first, then)
     assert inside.holds(0, 23.0)
+    # Whom the road ahead stops nobody waits for.
+    traffic.taken = {ahead}
+    assert not inside.holds(0, 23.0)
+    traffic.taken.clear()
     traffic.inside_veh = defaultdict(float)
     assert not inside.holds(0, 24.0)
     # Nor who has green in the next stage too.

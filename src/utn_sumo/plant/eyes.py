@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from utn_sumo.compiling import compiled
-from utn_sumo.contract import CLOSE_ZONES, ZONES_M, Bools, Floats, Ints, Network
+from utn_sumo.contract import CLOSE_ZONES, EXIT, ZONES_M, Bools, Floats, Ints, Network
 from utn_sumo.detectors import DetectorIds
 from utn_sumo.plant.buttons import Buttons
 from utn_sumo.plant.functions import bare
@@ -57,6 +57,8 @@ class Eyes:
         self._group_before = [ids.upstream[link] for link in self._group_link]
         self._group_stop_line = ids.group_stop_line
         self._amid = ids.amid
+        self._ahead = [() if turn.next_link == EXIT else ids.entry[turn.next_link] for turn in network.turns]
+        """(M,) entry loops of the link that each turn goes on to."""
         self._group_close: list[list[str]] = [[] for _ in network.groups]
         for group, zones in zip(network.set_group, ids.set_zone, strict=True):
             self._group_close[group] += chain.from_iterable(zones[:CLOSE_ZONES])
@@ -199,6 +201,10 @@ class Eyes:
     def standing_amid_veh(self, turn: int) -> float:
         """Of a turn that may wait amid the junction, standing or creeping on its lanes there."""
         return float(sum(map(self._halting, self._amid[turn])))
+
+    def is_taken(self, turn: int) -> bool:
+        """Whether somebody is on the entry loops of the road ahead: it is full, or has just let one more in."""
+        return any(since_s <= 0 for since_s in map(self._since_s, self._ahead[turn]))
 
     def close_veh(self, group: int) -> float:
         """In the zones of one lane group up to CLOSE_ZONES, moving or not."""

@@ -38,6 +38,7 @@ class Areas(Protocol):
 
     def amid_veh(self, turn: int) -> float: ...
     def standing_amid_veh(self, turn: int) -> float: ...
+    def is_taken(self, turn: int) -> bool: ...
     def close_veh(self, group: int) -> float: ...
     def pressed(self, junction: int, letters: str) -> bool: ...
 
@@ -163,9 +164,12 @@ class Inside:
         found_no_gap_veh = sum(areas.amid_veh(turn) for turn in way.left)
         if any(found_no_gap_veh > veh and areas.close_veh(group) > 0 for group, veh in way.coming):
             return True
-        late = way.walked if self._walked[index] else way.behind
+        # Whom the road ahead stops does not get away by it.
         return any(
-            areas.amid_veh(turn) > 0 and any(areas.close_veh(group) > 0 for group in groups) for turn, groups in late
+            areas.amid_veh(turn) > 0
+            and any(areas.close_veh(group) > 0 for group in groups)
+            and (self._walked[index] or not areas.is_taken(turn))
+            for turn, groups in (way.walked if self._walked[index] else way.behind)
         )
 
 
