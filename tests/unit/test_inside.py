@@ -190,9 +190,13 @@ def test_nobody_comes_in_while_more_than_two_stand_amid_the_junction(crossing: C
     for standing in (0.0, 2.0, 3.0):
         traffic.standing_veh = defaultdict(float, {crossing.turning[0]: standing})
         assert crossing.inside.holds(0, 23.0)
+        _lead(crossing.inside, crossing.through, crossing.across)
         assert ("G" in crossing.inside.meanwhile(0)) == (standing <= 2)
     # Who has green in the next stage is in nobody's way.
     traffic.standing_veh = defaultdict(float, {crossing.next_turning[0]: 3.0})
+    assert "G" in crossing.inside.meanwhile(0)
+    # Whose green has begun keeps it, whoever stands there now: there is no yellow.
+    traffic.standing_veh = defaultdict(float, {crossing.turning[0]: 3.0})
     assert "G" in crossing.inside.meanwhile(0)
 
 

@@ -21,7 +21,7 @@ from utn_sumo.clearances import GREEN
 from utn_sumo.contract import Network
 from utn_sumo.detectors import ids, write
 from utn_sumo.plant.heads import Heads
-from utn_sumo.plant.inside import MOST_HOLD_S
+from utn_sumo.plant.inside import MOST_HOLD_S, Inside
 
 StreetOf = Callable[[Callable[[Path], Path]], Network]
 
@@ -179,3 +179,18 @@ def test_nobody_loses_his_green_without_yellow_while_others_get_out(street_of: S
         assert not [
             letter for letter, (was, now) in enumerate(zip(before, after, strict=True)) if was + now in ("Gr", "gr")
         ]
+
+
+def test_who_has_been_let_in_keeps_his_green_whoever_stands_there_a_second_later(street_of: StreetOf) -> None:
+    network = street_of(odd_nets.carriageways)
+    traffic = Traffic()
+    inside = Inside(network, traffic)
+    street, main = sorted(network.junctions[0].stages, key=lambda each: _green(network, each, "W-a"))
+    inside.leads(0, main, street, "r" * len(network.stages[street].state), 23.0)
+    shown = []
+    for standing_veh in (0.0, 2.0, 0.0):
+        traffic.standing_veh[turn(network, "W-a", "a-b")] = standing_veh
+        shown.append({letter for letter, each in enumerate(inside.meanwhile(0)) if each in GREEN})
+    assert len(shown[0]) > 0
+    # Without yellow nobody's ends; those who stand there are let out besides.
+    assert shown[0] < shown[1] == shown[2]

@@ -64,8 +64,7 @@ class Heads:
         while self._due and self._due[0][0] <= now_s:
             _, index, _, letters, opens = heappop(self._due)
             if opens and self._inside is not None and self._inside.holds(index, now_s):
-                if meanwhile := self._inside.meanwhile(index):
-                    self._show(index, meanwhile)
+                self._show(index, self._inside.meanwhile(index))
                 self.begin_s[index] += HOLD_S
                 self._ready_s[index] += HOLD_S
                 heappush(self._due, (now_s + HOLD_S, index, next(self._numbers), letters, True))

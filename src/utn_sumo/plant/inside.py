@@ -67,6 +67,8 @@ class Way:
     """Turns that one before them may stop who found no gap, each with the lane groups that come into its way."""
     walked: tuple[tuple[int, tuple[int, ...]], ...]
     """Turns that people may stop who walk, as `behind`."""
+    becomes: str
+    """Letters of the next stage."""
     within: tuple[int, ...]
     """Turns onto roads within the junction that have green in the next stage."""
     outwards: str
@@ -90,6 +92,8 @@ class Inside:
         """By junction and its stages from which and to which they lead."""
         self._ways: dict[int, tuple[Way, float]] = {}
         """On which each junction came to its present stage, and when all of that have green at the latest."""
+        self._letters: dict[int, str] = {}
+        """By junction what has been shown last on the way there."""
         self._walked: dict[int, bool] = {}
         """By junction whether somebody was about to walk with its present stage as it was led to it."""
 
@@ -107,6 +111,7 @@ class Inside:
         if (index, first, then) not in self._known:
             self._known[index, first, then] = self._way(index, then, cleared)
         self._ways[index] = self._known[index, first, then], opens_s + MOST_HOLD_S
+        self._letters[index] = cleared
         self._walked[index] = self._areas.pressed(index, self._network.stages[then].state)
 
     def _way(self, index: int, then: int, cleared: str) -> Way:
@@ -119,7 +124,7 @@ class Inside:
             for turn in each.turns
         ]
         waits = {*junction.crossings, *(each.letter for each in turnings)}
-        through = _open(becomes, cleared, (letter not in waits for letter in range(len(becomes))))
+        through = _closed(becomes, cleared, (letter not in waits for letter in range(len(becomes))))
         wait = [each for each in turnings if becomes[each.letter] in GREEN and through[each.letter] not in GREEN]
         coming = tuple(group for each in wait for group in each.groups)
         late = [
@@ -137,6 +142,7 @@ class Inside:
             coming,
             tuple(behind),
             tuple(walked),
+            becomes,
             within,
             outwards,
             through,
@@ -144,11 +150,12 @@ class Inside:
         )
 
     def meanwhile(self, index: int) -> str:
-        """Letters that are shown while somebody has to wait: those of now, if empty."""
+        """Letters that are shown while somebody has to wait."""
         way, _ = self._ways[index]
-        if self._stands_within(way):
-            return way.outwards
-        return way.through if sum(map(self._areas.standing_amid_veh, way.ended)) <= MOST_STANDING_VEH else ""
+        within, standing_veh = self._stands_within(way), sum(map(self._areas.standing_amid_veh, way.ended))
+        if within or standing_veh <= MOST_STANDING_VEH:
+            self._letters[index] = _open(way.outwards if within else way.through, self._letters[index], way.becomes)
+        return self._letters[index]
 
     def _stands_within(self, way: Way) -> bool:
         """Whether somebody stands before a road within the junction whom the next stage lets out."""
@@ -173,13 +180,16 @@ class Inside:
         )
 
 
-def _open(state: str, cleared: str, opened: Iterable[bool]) -> str:
-    """A state with green for letters that are `opened` alone, and for who has had it in the letters before, `cleared`.
-
-    Without yellow nobody's ends.
-    """
-    letters = zip(state, cleared, opened, strict=True)
+def _closed(state: str, cleared: str, opens: Iterable[bool]) -> str:
+    """A state with red for letters that do not open, but for who has had green in the letters before, `cleared`."""
+    letters = zip(state, cleared, opens, strict=True)
     return "".join(shown if opens or shown not in GREEN or was in GREEN else "r" for shown, was, opens in letters)
+
+
+def _open(letters: str, before: str, becomes: str) -> str:
+    """Letters with green for who has had it before, and will: without yellow nobody's ends."""
+    each = zip(letters, before, becomes, strict=True)
+    return "".join(will if was in GREEN and will in GREEN else shown for shown, was, will in each)
 
 
 def _outwards(network: Network, junction: Junction, state: str, cleared: str) -> tuple[tuple[int, ...], str]:
@@ -191,7 +201,7 @@ def _outwards(network: Network, junction: Junction, state: str, cleared: str) ->
         {network.turns[turn].link for turn in turns if network.within[network.turns[turn].link]}
         for turns in junction.signal_turns
     ]
-    outwards = _open(state, cleared, map(bool, leads))
+    outwards = _closed(state, cleared, map(bool, leads))
     links = {link for shown, off in zip(state, leads, strict=True) if shown in GREEN for link in off}
     turns = tuple(index for index, turn in enumerate(network.turns) if turn.next_link in links)
     return (turns, outwards) if outwards != state else ((), "")
