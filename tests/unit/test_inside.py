@@ -166,38 +166,56 @@ def test_a_stage_that_is_held_begins_later_and_has_its_least_green_all_the_same(
     assert [bool(heads.free(heads.begin_s[0] + late_s)[0]) for late_s in (least_s - 1, least_s)] == [False, True]
 
 
-def test_all_others_of_the_next_green_have_it_while_turns_wait_for_those_inside(crossing: Crossing) -> None:
-    network, state = crossing.network, crossing.network.stages[crossing.across].state
-    crossing.full()
-    _lead(crossing.inside, crossing.through, crossing.across)
-    turning = {
-        letter
-        for letter, turns in enumerate(network.junctions[0].signal_turns)
-        if set(turns) & set(crossing.next_turning)
-    }
-    assert turning
-    assert crossing.inside.meanwhile(0) == "".join("r" if i in turning else shown for i, shown in enumerate(state))
-    assert "G" in crossing.inside.meanwhile(0)
+def _full(network: Network) -> tuple[Inside, Traffic, int, int]:
+    """Two turns amid a crossroads of two stages that found no gap, and everybody close to it."""
+    first, then = network.junctions[0].stages
+    traffic = Traffic()
+    traffic.inside_veh[_turns_with(network, first, "g")[0]] = 2.0
+    traffic.coming_veh = defaultdict(float, dict.fromkeys(range(len(network.groups)), 1.0))
+    return Inside(network, traffic), traffic, first, then
+
+
+def test_all_others_of_the_next_green_have_it_while_turns_wait_for_those_inside(street_of: StreetOf) -> None:
+    network = street_of(odd_nets.plain)
+    inside, traffic, first, then = _full(network)
+    _lead(inside, first, then)
+    assert inside.holds(0, 23.0)
+    state, turning = network.stages[then].state, set(_turns_with(network, then, "g"))
+    closed = {letter for letter, turns in enumerate(network.junctions[0].signal_turns) if turning & set(turns)}
+    assert closed
+    assert inside.meanwhile(0) == "".join("r" if i in closed else shown for i, shown in enumerate(state))
+    assert "G" in inside.meanwhile(0)
     # Who has had green all along keeps it: without yellow nobody's ends.
-    inside = Inside(network, crossing.traffic)
-    inside.leads(0, crossing.through, crossing.across, state, 23.0)
+    inside = Inside(network, traffic)
+    inside.leads(0, first, then, state, 23.0)
     assert inside.meanwhile(0) == state
 
 
-def test_nobody_comes_in_while_more_than_two_stand_amid_the_junction(crossing: Crossing) -> None:
+def test_nobody_has_green_while_turns_from_lanes_of_their_own_are_let_out(crossing: Crossing) -> None:
     traffic = crossing.full()
     _lead(crossing.inside, crossing.through, crossing.across)
+    assert crossing.inside.holds(0, 23.0)
+    assert set(crossing.inside.meanwhile(0)) == {"r"}
+    # They give way to all of the next road, and nobody is behind them who is in its way.
+    traffic.inside_veh.clear()
+    assert "G" in crossing.inside.meanwhile(0)
+
+
+def test_nobody_comes_in_while_more_than_two_stand_amid_the_junction(street_of: StreetOf) -> None:
+    network = street_of(odd_nets.plain)
+    inside, traffic, first, then = _full(network)
+    turning, next_turning = (_turns_with(network, stage, "g")[0] for stage in (first, then))
     for standing in (0.0, 2.0, 3.0):
-        traffic.standing_veh = defaultdict(float, {crossing.turning[0]: standing})
-        assert crossing.inside.holds(0, 23.0)
-        _lead(crossing.inside, crossing.through, crossing.across)
-        assert ("G" in crossing.inside.meanwhile(0)) == (standing <= 2)
+        traffic.standing_veh = defaultdict(float, {turning: standing})
+        _lead(inside, first, then)
+        assert inside.holds(0, 23.0)
+        assert ("G" in inside.meanwhile(0)) == (standing <= 2)
     # Who has green in the next stage is in nobody's way.
-    traffic.standing_veh = defaultdict(float, {crossing.next_turning[0]: 3.0})
-    assert "G" in crossing.inside.meanwhile(0)
+    traffic.standing_veh = defaultdict(float, {next_turning: 3.0})
+    assert "G" in inside.meanwhile(0)
     # Whose green has begun keeps it, whoever stands there now: there is no yellow.
-    traffic.standing_veh = defaultdict(float, {crossing.turning[0]: 3.0})
-    assert "G" in crossing.inside.meanwhile(0)
+    traffic.standing_veh = defaultdict(float, {turning: 3.0})
+    assert "G" in inside.meanwhile(0)
 
 
 def test_where_reds_may_be_drawn_out_who_waits_is_served_sooner(crossing: Crossing) -> None:

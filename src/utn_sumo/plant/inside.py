@@ -8,7 +8,8 @@ late is stopped amid the junction, turning or not: by those who step onto the cr
 or behind one who is. So while the lane-area detectors amid it see such vehicles, and others are about to come into
 their way, those who would stand in it then have to wait: turns in gaps, and people who walk. All others of the next
 green have it meanwhile, they drive on as soon as they can, unless so many stand there that these would stop, too, and
-block each other. People are about to walk where a button is pressed for a crossing that has green then.
+block each other, or those who found no gap have lanes of their own: nobody is behind them, and in red for all they get
+out at once. People are about to walk where a button is pressed for a crossing that has green then.
 
 Who stands before a road within the junction has the next green for himself where there are several: those from opposite
 sides stand in each other's way, and with others who come in nobody gets out any more.
@@ -22,7 +23,7 @@ from typing import Protocol
 
 import numpy as np
 
-from utn_sumo.clearances import GIVES_WAY, GREEN, HAS_WAY
+from utn_sumo.clearances import GIVES_WAY, GREEN, HAS_WAY, following
 from utn_sumo.contract import Bools, Junction, Network
 
 MOST_HOLD_S = 7.0
@@ -61,6 +62,8 @@ class Way:
 
     left: tuple[int, ...]
     """Turns for whom no gap in oncoming traffic may have come, and whom the next stage does not let out."""
+    alone: tuple[int, ...]
+    """Those from lanes of their own: the next road's traffic would never let them out, and nobody is behind them."""
     coming: tuple[tuple[int, float], ...]
     """Lane groups of turns of this kind that have green in it, as in `Turning`."""
     behind: tuple[tuple[int, tuple[int, ...]], ...]
@@ -86,8 +89,13 @@ class Inside:
         self._network = network
         self._areas = areas
         self._turnings = [_turnings(network, junction) for junction in network.junctions]
-        self._behind = _sharing(network, {turn for own in self._turnings for each in own for turn in each.turns})
+        giving = {turn for own in self._turnings for each in own for turn in each.turns}
+        self._behind = _sharing(network, giving)
         """Turns that may stand behind one that found no gap."""
+        self._sharing = giving & {
+            turn for each in network.lane_sets if self._behind & {*each.turns} for turn in each.turns
+        }
+        """Turns behind whom these stand."""
         self._known: dict[tuple[int, int, int], Way] = {}
         """By junction and its stages from which and to which they lead."""
         self._ways: dict[int, tuple[Way, float]] = {}
@@ -109,20 +117,23 @@ class Inside:
     def leads(self, index: int, first: int, then: int, cleared: str, opens_s: float) -> None:
         """A junction goes from its stage `first` to `then`, which is to begin at `opens_s`, after letters `cleared`."""
         if (index, first, then) not in self._known:
-            self._known[index, first, then] = self._way(index, then, cleared)
+            self._known[index, first, then] = self._way(index, first, then, cleared)
         self._ways[index] = self._known[index, first, then], opens_s + MOST_HOLD_S
         self._letters[index] = cleared
         self._walked[index] = self._areas.pressed(index, self._network.stages[then].state)
 
-    def _way(self, index: int, then: int, cleared: str) -> Way:
+    def _way(self, index: int, first: int, then: int, cleared: str) -> Way:
         network, junction, turnings = self._network, self._network.junctions[index], self._turnings[index]
         becomes = network.stages[then].state
+        is_own = then == following(junction, first)
         left = [
             turn
             for each in turnings
             if not any(becomes[letter] in GREEN for letter in (each.letter, *each.oncoming))
             for turn in each.turns
+            if turn in self._sharing or not is_own
         ]
+        alone = [turn for turn in left if turn not in self._sharing]
         waits = {*junction.crossings, *(each.letter for each in turnings)}
         through = _closed(becomes, cleared, (letter not in waits for letter in range(len(becomes))))
         wait = [each for each in turnings if becomes[each.letter] in GREEN and through[each.letter] not in GREEN]
@@ -139,6 +150,7 @@ class Inside:
         within, outwards = _outwards(network, junction, becomes, cleared)
         return Way(
             tuple(left),
+            tuple(alone),
             coming,
             tuple(behind),
             tuple(walked),
@@ -153,13 +165,18 @@ class Inside:
         """Letters that are shown while somebody has to wait."""
         way, _ = self._ways[index]
         within, standing_veh = self._stands_within(way), sum(map(self._areas.standing_amid_veh, way.ended))
-        if within or standing_veh <= MOST_STANDING_VEH:
+        if within or (standing_veh <= MOST_STANDING_VEH and not self._found_no_gap(way.alone, way)):
             self._letters[index] = _open(way.outwards if within else way.through, self._letters[index], way.becomes)
         return self._letters[index]
 
     def _stands_within(self, way: Way) -> bool:
         """Whether somebody stands before a road within the junction whom the next stage lets out."""
         return sum(map(self._areas.standing_amid_veh, way.within)) > BESIDE_VEH
+
+    def _found_no_gap(self, turns: tuple[int, ...], way: Way) -> bool:
+        """Whether more of these turns are amid the junction than those who are about to come can turn beside."""
+        veh = sum(map(self._areas.amid_veh, turns))
+        return any(veh > most and self._areas.close_veh(group) > 0 for group, most in way.coming)
 
     def holds(self, index: int, now_s: float) -> bool:
         """Whether some of the stage that a junction is led to have to wait for somebody."""
@@ -168,8 +185,7 @@ class Inside:
             return False
         if self._stands_within(way):
             return True
-        found_no_gap_veh = sum(areas.amid_veh(turn) for turn in way.left)
-        if any(found_no_gap_veh > veh and areas.close_veh(group) > 0 for group, veh in way.coming):
+        if self._found_no_gap(way.left, way):
             return True
         # Whom the road ahead stops does not get away by it.
         return any(
