@@ -84,16 +84,16 @@ def _add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
     return ET.SubElement(parent, tag, {name: str(value) for name, value in attributes.items()})
 
 
-def row(names: str, kind: str = "traffic_light", gap_m: float = 250, **more: Any) -> Streets:
+def row(names: str, kind: str = "traffic_light", gap_m: float = 250, arm_m: float = ARM_M, **more: Any) -> Streets:
     """Crossroads side by side from W to E, each with an arm to the north and one to the south."""
     streets = Streets()
     for place, name in enumerate(names):
         streets.node(name, place * gap_m, 0, kind)
-        for arm, y in ((f"n{name}", ARM_M), (f"s{name}", -ARM_M)):
+        for arm, y in ((f"n{name}", arm_m), (f"s{name}", -arm_m)):
             streets.node(arm, place * gap_m, y)
             streets.road(arm, name, **more)
-    streets.node("W", -ARM_M, 0)
-    streets.node("E", (len(names) - 1) * gap_m + ARM_M, 0)
+    streets.node("W", -arm_m, 0)
+    streets.node("E", (len(names) - 1) * gap_m + arm_m, 0)
     along = ["W", *names, "E"]
     for before, after in pairwise(along):
         streets.road(before, after, **more)

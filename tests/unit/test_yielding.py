@@ -54,6 +54,11 @@ def single_lanes(folder: Path, *greens: str) -> Path:
     return odd_nets.case(folder, odd_nets.traffic("C"))
 
 
+def arrows_and_arms(folder: Path) -> Path:
+    """Left turns from north and south have arrows, as netconvert has it; then the north, and the south, alone."""
+    return single_lanes(folder, odd_nets.NORTH_SOUTH, "rrGrrrrrGrrr", "GGGrrrrrrrrr", "rrrrrrGGGrrr")
+
+
 def an_arrow_for_a_shared_lane(folder: Path) -> Path:
     """Left turns from the north have an arrow: others may stand before it."""
     return single_lanes(folder, odd_nets.NORTH_SOUTH, "rrGrrrrrrrrr")
@@ -97,6 +102,14 @@ def beside_people(folder: Path) -> Path:
 @pytest.mark.parametrize("make", [odd_nets.plain, odd_nets.pedestrians, odd_nets.two_lanes, beside_people])
 def test_who_never_has_a_stage_alone_is_left_as_it_is(make: Make, street_of: StreetOf) -> None:
     assert left_turns(street_of(make)) == []
+
+
+def test_on_a_road_of_one_lane_a_stage_for_a_part_of_it_is_none_to_itself(street_of: StreetOf) -> None:
+    assert left_turns(street_of(an_arrow_for_a_shared_lane)) == []
+    network = street_of(arrows_and_arms)
+    assert sorted(network.group_link[left_turns(network)].tolist()) == sorted(
+        network.link_index(link) for link in ("nC-C", "sC-C")
+    )
 
 
 def test_left_turns_among_people_have_what_they_had_on_average_also_while_who_walks_is_cleared(

@@ -3,6 +3,11 @@
 A left turn that waits for gaps in what comes towards it hardly moves while that has a queue. Where another stage has
 it to itself, that one is to be shown in time.
 
+On a road of one lane not a stage that serves a part of it, as its left turns alone: that lets nobody go any more once
+somebody who drives on is in front. Each green of the whole road lets all in front of the first left turn go, and that
+one as it ends, so that short greens in turn let more go than such stages (gaps.py). Learnt to be slow, that green
+would have to make room for them.
+
 A lane with others beside it, from which some turn in such gaps over a road on which people walk, goes all green long at
 a third or a half of what it could, and while who walks is cleared too: what comes towards it is held up as well, so
 that there are more gaps than it would leave by itself, and who found one may have to wait again. Taken to go fast as a
@@ -42,16 +47,17 @@ class Yielding:
     def __init__(self, network: Network, streams: Streams, moves: Moves):
         """What each stream has of its discharge in `moves` is kept up to date."""
         self._network, self._streams, self._moves = network, streams, moves.share
-        in_part = _give_way(network, streams)
+        self._partly = _partly(streams, len(network.lane_sets))
+        """(S, L) lane sets of which a stage serves a part."""
+        in_part = _give_way(network, streams, self._partly)
         among = _among_walkers(network, streams) & ~in_part
         self.learnt = in_part | among
-        """(S, L) lane sets that must give way in a stage, and not in another one or to who walks besides."""
+        """(S, L) lane sets that must give way in a stage, and not in another one or to who walks besides: whose share
+        is learnt."""
         self._memory_s = np.where(among, WALKED_MEMORY_S, MEMORY_S)
         self._forget_s = np.where(among, WALKED_FORGET_S, FORGET_S)
         self._cleared = _cleared(streams, moves, among)
         self._cleared_share = moves.share[self._cleared[:2]]
-        self._partly = _partly(streams, len(network.lane_sets))
-        """(S, L) lane sets of which a stage serves a part."""
         self._stood_s = np.zeros((len(network.lane_sets), int(np.diff(streams.first_stage).max())))
         """(L, most stages of a junction) each one's green since somebody left, or nobody was by the stop line, last."""
         self._share = np.ones(self.learnt.shape)
@@ -82,8 +88,16 @@ class Yielding:
                 self._moves[row, place] = self._cleared_share * self._share[stage, lane_set]
 
 
-def _give_way(network: Network, streams: Streams) -> Bools:
-    """(S, L) lane sets of which somebody must give way in a stage, and nobody in another one of the junction's."""
+def _beside(network: Network) -> Bools:
+    """(Z,) links of more lane sets than one."""
+    return np.asarray(np.bincount(network.set_link, minlength=len(network.links)) > 1)
+
+
+def _give_way(network: Network, streams: Streams, partly: Bools) -> Bools:
+    """(S, L) lane sets of which somebody must give way in a stage, and nobody in another one of the junction's.
+
+    On roads of one lane set nor in one that serves a part of it: `partly` (S, L).
+    """
     gives_way = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=np.bool_)
     has_way = np.zeros_like(gives_way)
     for row, stage in enumerate(streams.stage):
@@ -93,7 +107,7 @@ def _give_way(network: Network, streams: Streams) -> Bools:
             (gives_way if GIVES_WAY in letters else has_way)[row, streams.lane_set[stream]] = True
     alone = np.zeros((len(network.junctions), len(network.lane_sets)), dtype=np.bool_)
     junction = network.stage_junction[streams.stage]
-    np.logical_or.at(alone, junction, has_way & ~gives_way)
+    np.logical_or.at(alone, junction, has_way & ~gives_way & (_beside(network)[network.set_link] | ~partly))
     return np.asarray(gives_way & alone[junction])
 
 
@@ -102,7 +116,7 @@ def _among_walkers(network: Network, streams: Streams) -> Bools:
 
     Of a single lane all wait for the first: it goes as gaps.py has it.
     """
-    beside = np.bincount(network.set_link, minlength=len(network.links)) > 1
+    beside = _beside(network)
     found = np.zeros((len(streams.stage), len(network.lane_sets)), dtype=np.bool_)
     for row, stage in enumerate(streams.stage):
         junction, state = network.junctions[network.stage_junction[stage]], network.stages[stage].state

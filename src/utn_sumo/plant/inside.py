@@ -90,7 +90,7 @@ class Inside:
         self._areas = areas
         self._turnings = [_turnings(network, junction) for junction in network.junctions]
         giving = {turn for own in self._turnings for each in own for turn in each.turns}
-        self._behind = _sharing(network, giving)
+        self._behind = _who_share(network, giving)
         """Turns that may stand behind one that found no gap."""
         self._sharing = giving & {
             turn for each in network.lane_sets if self._behind & {*each.turns} for turn in each.turns
@@ -133,11 +133,9 @@ class Inside:
             for turn in each.turns
             if turn in self._sharing or not is_own
         ]
-        alone = [turn for turn in left if turn not in self._sharing]
         waits = {*junction.crossings, *(each.letter for each in turnings)}
         through = _closed(becomes, cleared, (letter not in waits for letter in range(len(becomes))))
         wait = [each for each in turnings if becomes[each.letter] in GREEN and through[each.letter] not in GREEN]
-        coming = tuple(group for each in wait for group in each.groups)
         late = [
             (turn, letter)
             for letter, turns in enumerate(junction.signal_turns)
@@ -149,16 +147,16 @@ class Inside:
         walked = [(turn, _come(network, junction, letter, driving)) for turn, letter in late if junction.is_walked]
         within, outwards = _outwards(network, junction, becomes, cleared)
         return Way(
-            tuple(left),
-            tuple(alone),
-            coming,
-            tuple(behind),
-            tuple(walked),
-            becomes,
-            within,
-            outwards,
-            through,
-            tuple(turn for turn, _ in late),
+            left=tuple(left),
+            alone=tuple(turn for turn in left if turn not in self._sharing),
+            coming=tuple(group for each in wait for group in each.groups),
+            behind=tuple(behind),
+            walked=tuple(walked),
+            becomes=becomes,
+            within=within,
+            outwards=outwards,
+            through=through,
+            ended=tuple(turn for turn, _ in late),
         )
 
     def meanwhile(self, index: int) -> str:
@@ -223,7 +221,7 @@ def _outwards(network: Network, junction: Junction, state: str, cleared: str) ->
     return (turns, outwards) if outwards != state else ((), "")
 
 
-def _sharing(network: Network, giving: set[int]) -> set[int]:
+def _who_share(network: Network, giving: set[int]) -> set[int]:
     """Turns that share a lane with some of those that are `giving` way, and are none of them."""
     sets = (lane_set.turns for lane_set in network.lane_sets)
     return {turn for turns in sets if not giving.isdisjoint(turns) for turn in turns} - giving
