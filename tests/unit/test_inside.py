@@ -201,10 +201,26 @@ def test_nobody_has_green_while_turns_from_lanes_of_their_own_are_let_out(crossi
     assert "G" in crossing.inside.meanwhile(0)
 
 
-def test_nobody_comes_in_while_more_than_two_stand_amid_the_junction(street_of: StreetOf) -> None:
-    network = street_of(odd_nets.plain)
+def _straight_on_two_lanes(network: Network, stage: int) -> int:
+    """The first turn that goes straight on from two lanes, a letter each."""
+    straight = _turns_with(network, stage, "G")
+    return next(turn for turn in straight if straight.count(turn) == 2)
+
+
+@pytest.mark.parametrize(
+    ("make", "stands"),
+    [
+        (odd_nets.plain, lambda network, stage: _turns_with(network, stage, "g")[0]),
+        (odd_nets.two_lanes, _straight_on_two_lanes),
+    ],
+    ids=["turning", "straight on, two lanes abreast"],
+)
+def test_nobody_comes_in_while_more_than_two_stand_amid_the_junction(
+    street_of: StreetOf, make: Callable[[Path], Any], stands: Callable[[Network, int], int]
+) -> None:
+    network = street_of(make)
     inside, traffic, first, then = _full(network)
-    turning, next_turning = (_turns_with(network, stage, "g")[0] for stage in (first, then))
+    turning, next_turning = (stands(network, stage) for stage in (first, then))
     for standing in (0.0, 2.0, 3.0):
         traffic.standing_veh = defaultdict(float, {turning: standing})
         _lead(inside, first, then)

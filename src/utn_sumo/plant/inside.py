@@ -79,7 +79,7 @@ class Way:
     through: str
     """With those red of turns that give way in some stage, and of people, but for who keeps green all along."""
     ended: tuple[int, ...]
-    """Turns that have no green in it."""
+    """Turns that have no green in it, each once: several lanes abreast have a letter each."""
 
 
 class Inside:
@@ -156,7 +156,7 @@ class Inside:
             within=within,
             outwards=outwards,
             through=through,
-            ended=tuple(turn for turn, _ in late),
+            ended=tuple(dict.fromkeys(turn for turn, _ in late)),
         )
 
     def meanwhile(self, index: int) -> str:
