@@ -20,7 +20,7 @@ from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.gaps import AMID_VEH, GAP_S, HEADWAY_S, Gaps, Giving, clear, headways, let_go
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
-from utn_sumo.contract import Network
+from utn_sumo.contract import Floats, Network
 from utn_sumo.network import load
 from utn_sumo.network.lanes import lane_sets, unevenness
 
@@ -50,6 +50,7 @@ def queues(
         np.full((1, 2), 2.0),
         np.array([True]),
         np.array([[beside, False]]),
+        np.zeros((1, 2), dtype=bool),
         np.array([[shut, False]]),
         np.ones((1, 2)),
         np.ones((1, 2)),
@@ -58,11 +59,55 @@ def queues(
     )
     veh, come = np.array([10.0, towards_veh]), np.zeros((2, BINS))
     come[1] = come_veh
-    pace, free, want, left = np.ones(2), np.array([flowing, 1.0]), np.zeros(2), []
+    pace, free, left, kept = np.ones(2), np.array([flowing, 1.0]), [], np.zeros((3, 2))
     for bin_ in range(BINS):
-        let_go(0, bin_, veh, come, np.ones(2), np.ones((1, 2)), np.array([[0, 1, -1]]), gaps, pace, free, want)
+        let_go(0, bin_, veh, come, np.ones(2), np.ones((1, 2)), np.array([[0, 1, -1]]), gaps, pace, free, *kept)
         left.append(float(veh[0]))
     return left
+
+
+def facing(waiting: tuple[float, float], queued_veh: float, *, has_room: bool = True) -> tuple[Floats, Floats]:
+    """Of two roads of one lane that face each other: who goes in each bin of a green, and who stands amid at its end.
+
+    Twenty vehicles stand on the first and `queued_veh` on the second, of which these shares wait for gaps.
+    """
+    gaps = Gaps(
+        np.array([waiting]), np.array([[[1, -1], [0, -1]]]), np.ones((1, 2)), np.array([True]),
+        np.zeros((1, 2), dtype=bool), np.full((1, 2), has_room), np.zeros((1, 2), dtype=bool),
+        *np.ones((2, 1, 2)), np.full((1, 2), GAP_S), BIN_S,
+    )  # fmt: skip
+    veh, come, going = np.array([20.0, queued_veh]), np.zeros((2, BINS)), np.array([[0, 1, -1]])
+    pace, free, to_come, *kept = np.ones((5, 2))
+    stood = [veh.copy()]
+    for bin_ in range(BINS):
+        let_go(0, bin_, veh, come, np.ones(2), np.ones((1, 2)), going, gaps, pace, free, to_come, *kept)
+        stood.append(veh.copy())
+    amid = np.zeros(2)
+    clear(0, np.full(2, 10.0), np.ones(2), going, gaps, pace, to_come, amid)
+    return -np.diff(stood, axis=0), amid
+
+
+@given(one=st.floats(0.1, 0.9), other=st.floats(0.1, 0.9))
+def test_two_single_lanes_go_until_somebody_waits_then_both_have_what_one_lane_discharges(
+    one: float, other: float
+) -> None:
+    goes, amid = facing((one, other), 20.0)
+    assert goes[0] == pytest.approx(np.ones(2))
+    assert 0.85 < goes[-1].sum() < 1.35
+    # That lane goes the more of which fewer wait.
+    assert (goes[-1, 0] - goes[-1, 1]) * (other - one) >= -1e-9
+    # Who does not go stands amid it as the green ends.
+    assert amid == pytest.approx(1 - goes[-1], abs=0.01)
+
+
+def test_nobody_is_thought_to_stand_amid_it_before_few_who_come_towards_him() -> None:
+    goes, amid = facing((0.3, 0.3), 0.5)
+    assert (goes[2:6, 0] > 0.9).all()
+    assert amid[0] == 0
+
+
+def test_before_full_roads_they_find_gaps_as_in_what_comes_at_random() -> None:
+    assert facing((0.3, 0.3), 20.0, has_room=False)[0][0, 0] < 1
 
 
 def test_with_nobody_towards_him_he_goes_as_if_he_had_way() -> None:
@@ -128,7 +173,7 @@ def test_two_of_a_lane_that_stands_for_a_gap_go_as_its_green_ends_and_none_of_on
 ) -> None:
     gaps = Gaps(
         np.array([[0.3, 0.0]]), np.array([[[1, -1], [-1, -1]]]), np.full((1, 2), 2.0), np.array([True]),
-        *np.zeros((2, 1, 2), dtype=bool), np.ones((1, 2)), np.ones((1, 2)), np.full((1, 2), GAP_S), BIN_S,
+        *np.zeros((3, 1, 2), dtype=bool), np.ones((1, 2)), np.ones((1, 2)), np.full((1, 2), GAP_S), BIN_S,
     )  # fmt: skip
     veh, amid, going = np.array([queued_veh, 5.0]), np.ones(2), np.array([[0, 1, -1]])
     clear(0, veh, np.full(2, float(lanes)), going, gaps, np.array([pace, 0.0]), np.array([to_come, 1.0]), amid)

@@ -112,6 +112,43 @@ def test_on_a_road_of_one_lane_a_stage_for_a_part_of_it_is_none_to_itself(street
     )
 
 
+def an_arrow_for_a_shared_lane_of_two(folder: Path) -> Path:
+    """Left turns from north and south have an arrow, those who go on from the same lane have none."""
+    net = odd_nets.row("C", lanes=2).net(folder, odd_nets.NO_TURNAROUNDS)
+    greens = ("gGGgrrrrgGGgrrrr", "rrrGrrrrrrrGrrrr", "rrrrgGGgrrrrgGGg")
+    odd_nets.retime(
+        net,
+        odd_nets.tl_logic(
+            "C",
+            [phase for state in greens for phase in ((20, state), (3, state.replace("G", "y").replace("g", "y")))],
+        ),
+    )
+    return odd_nets.case(folder, odd_nets.traffic("C"))
+
+
+def test_in_a_stage_for_a_part_of_a_lane_beside_others_it_has_what_it_had_of_late(street_of: StreetOf) -> None:
+    network = street_of(an_arrow_for_a_shared_lane_of_two)
+    streams = Streams(network)
+    all_moves = Moves(network, streams, 2, are_alone(network, streams))
+    learning, moves = Yielding(network, streams, all_moves), all_moves.share
+    arrow = next(row for row, stage in enumerate(streams.stage) if "g" not in network.stages[stage].state)
+    turning = np.flatnonzero(streams.serves[arrow])
+    assert len(turning) == 2
+    assert learning.learnt[arrow, streams.lane_set[turning]].all()
+    queue = by_the_line(np.full(len(network.lane_sets), QUEUE_VEH))
+    # In each green somebody goes for some seconds, then the next has red.
+    left_veh = np.zeros(len(network.lane_sets))
+    for green in range(10):
+        for second in (0, 3, 6, 9):
+            left_veh += network.set_saturation_flow_veh_s * (3 if second == 6 else 0)
+            view = replace(
+                scene(network, 60.0 * green + second), begin_s=np.array([60.0 * green]), left_veh=left_veh.copy()
+            )
+            learning.look(view, np.array([True]), np.array([arrow]), queue)
+    assert (moves[arrow, turning] < 0.8).all()
+    assert (moves[arrow, turning] > 0.2).all()
+
+
 def test_left_turns_among_people_have_what_they_had_on_average_also_while_who_walks_is_cleared(
     street_of: StreetOf,
 ) -> None:

@@ -180,7 +180,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
     # Of the streams that move in a stage what their queues would weigh in red, and of those that move in a clearance
     # how many more stood at its end if they had red.
     waits, stays_on, fewer = np.empty((3, streams))
-    pace, free, want, to_come, amid = np.ones((5, streams))
+    pace, free, want, queued, to_come, amid = np.ones((6, streams))
     stood, left = np.empty((2, stages + 1))
     for begin in range(bins):
         for stage in range(stages):
@@ -285,7 +285,7 @@ def _search(  # noqa: C901, PLR0912, PLR0915 - one search, all in one place for 
                         veh[stream] = max(veh[stream] + come[stream, now] - leaves, 0.0)
                         moving += worth[stream] * veh[stream]
                 else:
-                    let_go(row, now, veh, come, most, moves, going, gaps, pace, free, want)
+                    let_go(row, now, veh, come, most, moves, going, gaps, pace, free, to_come, want, queued)
                     for place in range(greens):
                         moving += worth[going[row, place]] * veh[going[row, place]]
                 now += 1
@@ -459,7 +459,7 @@ def _send_off(
 @compiled
 def _let_all_go(plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats, most: Floats, sent: Floats) -> None:
     """Fills `sent` (n, K) as `_send_off` where somebody waits for gaps: bin by bin, from the vehicles `veh` (n,) on."""
-    pace, free, want, to_come, amid = np.ones((5, len(veh)))
+    pace, free, want, queued, to_come, amid = np.ones((6, len(veh)))
     before = -1
     for place, row in enumerate(plan):
         sent[:, place] = veh + come[:, place]
@@ -474,6 +474,6 @@ def _let_all_go(plan: Ints, rules: Rules, gaps: Gaps, veh: Floats, come: Floats,
             if not (green and share > 0):
                 veh[stream] = max(veh[stream] + come[stream, place] - share * most[stream], 0.0)
         if green:
-            let_go(row, place, veh, come, most, rules.moves, rules.going, gaps, pace, free, want)
+            let_go(row, place, veh, come, most, rules.moves, rules.going, gaps, pace, free, to_come, want, queued)
         sent[:, place] -= veh
         before = row

@@ -14,6 +14,10 @@ that there are more gaps than it would leave by itself, and who found one may ha
 green begins and to stand when some wait (gaps.py), it would have another green whenever it stands, with all that
 clearances take.
 
+Nor does a lane with others beside it go as it could in a stage that serves a part of it, as an arrow for left turns
+from a lane shared with who drives straight on: it goes until the first of the others is in front. How far that is on
+average is learnt too.
+
 And who has green does not go at all while the first of his lane has red. Where a stage serves a part of a lane set and
 nobody of its queue has gone for a while, in one green or in several short ones, somebody of the other part is in front:
 that stage, and whichever serves no more of the lane set, is of no use until another one has let somebody go.
@@ -51,9 +55,9 @@ class Yielding:
         """(S, L) lane sets of which a stage serves a part."""
         in_part = _give_way(network, streams, self._partly)
         among = _among_walkers(network, streams) & ~in_part
-        self.learnt = in_part | among
-        """(S, L) lane sets that must give way in a stage, and not in another one or to who walks besides: whose share
-        is learnt."""
+        self.learnt = in_part | among | (self._partly & _beside(network)[network.set_link])
+        """(S, L) lane sets that must give way in a stage, and not in another one or to who walks besides, and with
+        others beside them those of which it serves a part: whose share is learnt."""
         self._memory_s = np.where(among, WALKED_MEMORY_S, MEMORY_S)
         self._forget_s = np.where(among, WALKED_FORGET_S, FORGET_S)
         self._cleared = _cleared(streams, moves, among)
