@@ -20,7 +20,7 @@ from utn_controllers.scheduled.execution import Scheduled
 from utn_controllers.scheduled.gaps import AMID_VEH, GAP_S, HEADWAY_S, Gaps, Giving, clear, headways, let_go
 from utn_controllers.scheduled.streams import Streams
 from utn_sumo.clearances import GIVES_WAY
-from utn_sumo.contract import Floats, Network
+from utn_sumo.contract import EXIT, Floats, Network
 from utn_sumo.network import load
 from utn_sumo.network.lanes import lane_sets, unevenness
 
@@ -305,6 +305,31 @@ def test_how_a_lane_goes_is_seen_in_the_green_that_it_has_and_forgotten_with_it(
     assert seen[14] == 1 if left_share > 0.75 and not full else seen[14] < 0.1
     assert left_ends[14] < 0.1 or not counts.any()
     assert seen[16:18] == [1.0, 1.0]
+
+
+def two_signals(folder: Path) -> Path:
+    """Single lanes, two junctions with a road between them."""
+    return odd_nets.row("AB").net(folder, odd_nets.NO_TURNAROUNDS)
+
+
+@pytest.mark.parametrize(("make", "alone"), [(two_signals, True), (odd_nets.two_lanes, False)])
+def test_single_lanes_face_each_other_as_long_as_the_roads_that_they_lead_onto_have_room(
+    make: Make, alone: bool, street_of: StreetOf
+) -> None:
+    network = street_of(make)
+    streams, giving = Streams(network), Scheduled(network)._giving
+    everywhere, nobody = np.ones(len(network.junctions), dtype=bool), np.zeros(len(streams.link), dtype=bool)
+    queues_veh = by_the_line(np.zeros(len(network.lane_sets)))
+    for full in (np.zeros(len(network.links), dtype=bool), *np.eye(len(network.links), dtype=bool)):
+        view = replace(scene(network, 10.0), x_veh=network.storage_veh * full)
+        giving.look(view, everywhere, streams.first_stage[:-1], queues_veh, nobody)
+        onto_full = np.isin(
+            streams.lane_set,
+            streams.lane_set[(streams.next_link != EXIT) & full[np.maximum(streams.next_link, 0)]],
+        )
+        for row, stream in zip(*streams.serves.nonzero(), strict=True):
+            place = stream - streams.first[network.stage_junction[streams.stage[row]]]
+            assert giving.gaps.facing[row, place] == (alone and not onto_full[stream])
 
 
 def sets_of(ways: dict[int, dict[int, set[int]]], states: list[str], **share: float) -> list[tuple[int, ...]]:
