@@ -131,6 +131,7 @@ class Crossing:
             (waiting > 0).any(axis=1),
             np.zeros(shape, dtype=np.bool_),
             np.zeros(shape, dtype=np.bool_),
+            np.zeros(shape, dtype=np.bool_),
             np.full(shape, self.flowing),
             np.full(shape, self.to_come),
             np.full(shape, 4.0),
