@@ -201,6 +201,14 @@ def test_nobody_has_green_while_turns_from_lanes_of_their_own_are_let_out(crossi
     assert "G" in crossing.inside.meanwhile(0)
 
 
+def test_a_clearance_that_ends_with_yellow_is_drawn_out_as_red(crossing: Crossing) -> None:
+    crossing.full()
+    letters = len(crossing.network.stages[crossing.across].state)
+    crossing.inside.leads(0, crossing.through, crossing.across, "y" * letters, 23.0)
+    assert crossing.inside.holds(0, 23.0)
+    assert crossing.inside.meanwhile(0) == "r" * letters
+
+
 def _straight_on_two_lanes(network: Network, stage: int) -> int:
     """The first turn that goes straight on from two lanes, a letter each."""
     straight = _turns_with(network, stage, "G")

@@ -11,6 +11,7 @@ import numpy as np
 from utn_sumo import clearances
 from utn_sumo.clearances import Phases, Times
 from utn_sumo.contract import Bools, Ints, Network
+from utn_sumo.plant.freeing import Freeing
 from utn_sumo.plant.inside import MOST_HOLD_S, Areas, Inside
 from utn_sumo.plant.patience import LONGEST_RED_S, Patience
 
@@ -43,6 +44,8 @@ class Heads:
         held_s = np.zeros(len(network.junctions))
         if self._inside is not None:
             held_s += MOST_HOLD_S * self._inside.may_hold()
+            yellow_s = [times.yellow_s for times in self._times]
+            self._freeing = Freeing(self._inside, yellow_s, network.least_green_s)
         self.patience = Patience(network, held_s, longest_red_s)
         self._due: list[tuple[float, int, int, str, bool]] = []
         """A heap of (time, junction, number, letters, whether its stage begins with them) still to be shown."""
@@ -63,14 +66,23 @@ class Heads:
             return
         while self._due and self._due[0][0] <= now_s:
             _, index, _, letters, opens = heappop(self._due)
-            if opens and self._inside is not None and self._inside.holds(index, now_s):
-                self._show(index, self._inside.meanwhile(index))
+            waits = self._waits(index, now_s) if opens else None
+            if waits is not None:
+                self._show(index, waits)
                 self.begin_s[index] += HOLD_S
                 self._ready_s[index] += HOLD_S
                 heappush(self._due, (now_s + HOLD_S, index, next(self._numbers), letters, True))
                 continue
             self._show(index, letters)
         self.next_s = self._due[0][0] if self._due else np.inf
+
+    def _waits(self, index: int, now_s: float) -> str | None:
+        """Letters of a junction while its stage has to wait for somebody amid it."""
+        if self._inside is None:
+            return None
+        if self._inside.holds(index, now_s):
+            return self._inside.meanwhile(index)
+        return self._freeing.shows(index, now_s)
 
     def free(self, now_s: float) -> Bools:
         """(J,) junctions whose stage has had its least green: they may go on to another."""
@@ -91,6 +103,7 @@ class Heads:
             phases = self._ways[first, stage]
             cleared = phases[-1][0] if phases else self.network.stages[first].state
             self._inside.leads(index, first, stage, cleared, at_s)
+            self._freeing.leads(index, stage, self.patience.spares(index, now_s, self._freeing.longest_s))
         self.stage[index], self.begin_s[index] = stage, at_s
         self._ready_s[index] = at_s + self.network.stages[stage].least_green_s
         self.next_s = now_s

@@ -23,7 +23,7 @@ from typing import Protocol
 
 import numpy as np
 
-from utn_sumo.clearances import GIVES_WAY, GREEN, HAS_WAY, following
+from utn_sumo.clearances import GIVES_WAY, GREEN, HAS_WAY, YELLOW, following
 from utn_sumo.contract import Bools, Junction, Network
 
 MOST_HOLD_S = 7.0
@@ -99,7 +99,9 @@ class Inside:
         self._known: dict[tuple[int, int, int], Way] = {}
         """By junction and its stages from which and to which they lead."""
         self._ways: dict[int, tuple[Way, float]] = {}
-        """On which each junction came to its present stage, and when all of that have green at the latest."""
+        """On which each junction came to its present stage, and how long anybody has to wait at most."""
+        self._cleared: dict[int, str] = {}
+        """By junction what is shown at the end of the clearance on the way there, with all yellow over."""
         self._letters: dict[int, str] = {}
         """By junction what has been shown last on the way there."""
         self._walked: dict[int, bool] = {}
@@ -119,7 +121,7 @@ class Inside:
         if (index, first, then) not in self._known:
             self._known[index, first, then] = self._way(index, first, then, cleared)
         self._ways[index] = self._known[index, first, then], opens_s + MOST_HOLD_S
-        self._letters[index] = cleared
+        self._letters[index] = self._cleared[index] = "".join("r" if shown in YELLOW else shown for shown in cleared)
         self._walked[index] = self._areas.pressed(index, self._network.stages[then].state)
 
     def _way(self, index: int, first: int, then: int, cleared: str) -> Way:
@@ -192,6 +194,33 @@ class Inside:
             and (self._walked[index] or not areas.is_taken(turn))
             for turn, groups in (way.walked if self._walked[index] else way.behind)
         )
+
+    def held_s(self, index: int, now_s: float) -> float:
+        """For how long now nobody has to wait any more, whoever is amid the junction."""
+        return now_s - self._ways[index][1]
+
+    def behind(self, index: int) -> dict[int, bool]:
+        """Turns that another may have stopped in the way of others, with whether somebody stands there."""
+        (way, _), areas = self._ways[index], self._areas
+        return {
+            turn: areas.standing_amid_veh(turn) > 0 and not areas.is_taken(turn)
+            for turn, groups in way.behind
+            if groups
+        }
+
+    def shown(self, index: int) -> str:
+        """What was shown last while somebody had to wait."""
+        return self._letters[index]
+
+    def closing(self, index: int) -> tuple[list[int], str]:
+        """Letters that have got green meanwhile, and what is shown without."""
+        cleared = self._cleared[index]
+        opened = [
+            letter
+            for letter, (shown, was) in enumerate(zip(self._letters[index], cleared, strict=True))
+            if shown in GREEN and was not in GREEN
+        ]
+        return opened, cleared
 
 
 def _closed(state: str, cleared: str, opens: Iterable[bool]) -> str:

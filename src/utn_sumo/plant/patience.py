@@ -82,6 +82,11 @@ class Patience:
                 allowed[junction] = first
         return allowed
 
+    def spares(self, junction: int, now_s: float, seconds: float) -> bool:
+        """Whether all who wait before a junction could be served in time if its next stage began `seconds` later."""
+        since_s = self._since_s[self._junction == junction]
+        return bool((since_s + self._carefree_s[junction] > now_s + seconds).all())
+
     def look(self, view: View) -> None:
         """See who waits, if it is time to."""
         if view.time_s < self._look_s:
